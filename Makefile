@@ -1,0 +1,87 @@
+# Builds, tests and shows manylights in a virtual environment of its own. What the machine
+# must have: Python 3.9 or later with venv, a C++17 compiler, make. Type `make help`.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip --disable-pip-version-check
+
+# Extra arguments for pytest, as in: make test ARGS="-k tree -x"
+ARGS ?=
+
+# Object files stay here between builds. Ninja uses all cores; to use fewer, set the
+# environment variable CMAKE_BUILD_PARALLEL_LEVEL.
+BUILD_DIR := build/make
+
+SOURCES  := CMakeLists.txt pyproject.toml \
+            $(shell find ext plugins python -type f -not -name '*.pyc')
+CPP_DIRS := $(wildcard ext plugins tests)
+
+# The package is installed again when a source file or the choice of variants changes: the
+# name of the stamp has a checksum of that choice.
+VARIANTS_ID := $(shell printf '%s' "$$MANYLIGHTS_VARIANTS" | cksum | cut -d ' ' -f 1)
+INSTALLED   := $(VENV)/.installed-$(VARIANTS_ID)
+
+.PHONY: help
+help:  ## Show this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
+
+.PHONY: demo
+demo: $(INSTALLED)  ## Render a city with more than 10,000 lights to demo.exr and demo.png
+	$(BIN)/manylights demo -o demo
+
+.PHONY: build
+build: $(INSTALLED)  ## Compile the plugins and install the package into .venv
+
+.PHONY: test
+test: $(INSTALLED)  ## Run the quick tests
+	$(BIN)/python -m pytest $(ARGS)
+
+.PHONY: test-slow
+test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+.PHONY: lint
+lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling
+	$(BIN)/ruff check python tests
+	$(BIN)/ruff format --check python tests
+	find $(CPP_DIRS) -name '*.h' -o -name '*.cpp' | xargs -r $(BIN)/clang-format --dry-run -Werror
+
+.PHONY: format
+format: $(VENV)/.dev-tools  ## Rewrite the sources in the style that lint checks
+	$(BIN)/ruff check --fix python tests
+	$(BIN)/ruff format python tests
+	find $(CPP_DIRS) -name '*.h' -o -name '*.cpp' | xargs -r $(BIN)/clang-format -i
+
+.PHONY: clean
+clean:  ## Delete everything that was built, .venv too
+	rm -rf build dist $(VENV) .pytest_cache .ruff_cache .hypothesis demo.exr demo.png
+	find python tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# pip 25.1 is the first that can install the dependency groups of pyproject.toml.
+$(VENV)/.created:
+	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || { rm -rf $(VENV); \
+	  echo "Could not make a virtual environment. On Debian and Ubuntu, type"; \
+	  echo "  sudo apt-get install python3-venv"; exit 1; } >&2
+	$(PIP) install --quiet --upgrade 'pip>=25.1'
+	@touch $@
+
+$(VENV)/.dev-tools: pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --group dev
+	@touch $@
+
+$(VENV)/.build-tools: pyproject.toml | $(VENV)/.created
+	@command -v $${CXX:-c++} >/dev/null || { \
+	  echo "There is no C++ compiler. On Debian and Ubuntu, type"; \
+	  echo "  sudo apt-get install g++"; exit 1; } >&2
+	@test -e "$$($(BIN)/python -c 'import sysconfig as s; print(s.get_path("include"))')/Python.h" \
+	  || { echo "Python.h is missing: tests of the C++ parts will be skipped. To run them, type"; \
+	       echo "  sudo apt-get install python3-dev"; } >&2
+	$(PIP) install --quiet --group build
+	@touch $@
+
+# Without build isolation the paths of the headers stay the same, and with them the objects.
+$(INSTALLED): $(VENV)/.build-tools $(SOURCES)
+	@echo "Compiling the plugins. The first time takes some minutes."
+	$(PIP) install --quiet --no-build-isolation -C build-dir=$(BUILD_DIR) '.[test]'
+	@rm -f $(VENV)/.installed-* && touch $@

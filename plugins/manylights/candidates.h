@@ -1,0 +1,315 @@
+#pragma once
+
+/**
+ * Candidates: the N' lights that a shading point considers, one after the other.
+ *
+ * Three sources with one interface, used by the loop in direct_light.h:
+ *
+ *     Mask has_next() const;                 is there another candidate?
+ *     Candidate next(tree, receiver, rng);   find it and move on
+ *
+ * - \ref AllLights: every light, with probability 1 (few lights, or infinite rate).
+ * - \ref SystematicCursor: systematic sampling of the tree (default).
+ * - \ref StochasticCursor: the talk's stochastic splitting (method `talk`).
+ *
+ * Candidates of one point are always distinct lights.
+ */
+
+#include "light_tree.h"
+#include <drjit/random.h>
+
+namespace manylights {
+
+/// A light and the probability with which it became a candidate
+template <typename Float> struct Candidate {
+    using UInt32 = dr::uint32_array_t<Float>;
+    using Mask   = dr::mask_t<Float>;
+    UInt32 light;
+    Float probability;
+    Mask valid;
+    /// Nodes visited on the way (statistics only; dead code in a kernel)
+    UInt32 visits;
+};
+
+/// Largest float below 1
+constexpr float kBelowOne = 0x1.fffffep-1f;
+/// K above which systematic sampling would lose the fraction of a float: visit all lights
+constexpr float kMaxExpectedCandidates = 1 << 20;
+/// K for a splitting rate of 1 (24 measured best over the prototype's scenes)
+constexpr float kCandidatesPerRate = 24.f;
+
+template <typename Float> struct AllLights {
+    using UInt32 = dr::uint32_array_t<Float>;
+
+    UInt32 index, count;
+    DRJIT_STRUCT(AllLights, index, count)
+
+    auto has_next() const { return index < count; }
+
+    template <typename Rng>
+    Candidate<Float> next(const TreeView<Float> &, const Receiver<Float> &, Rng &) {
+        Candidate<Float> result{ index, Float(1.f), true, UInt32(0) };
+        index += 1u;
+        return result;
+    }
+};
+
+/**
+ * Systematic sampling of the leaves, in the order of the tree.
+ *
+ * The leaves tile [0, 1) by their probability w of a single descent. K equidistant points
+ * x_k = (k + u) / K with one random number u select those that they fall on: a leaf is
+ * reached with probability A = min(1, K w), exactly, and A is continuous in x. A node is
+ * thereby split whenever more than one point falls on it: one random number drives the
+ * whole traversal and the probability of splitting decreases with depth, as in the talk,
+ * but N' <= K always.
+ *
+ * Every point descends from the root, or from one of two remembered nodes known to hold
+ * the next point ("trail"): no stack, and all SIMD lanes stay alike. A trail that
+ * overflows costs time only.
+ */
+template <typename Float> struct SystematicCursor {
+    using UInt32 = dr::uint32_array_t<Float>;
+    using Mask   = dr::mask_t<Float>;
+
+    /// A node and the interval [lower, lower + width) of the leaves below it
+    struct Place {
+        UInt32 node;
+        Float lower, width;
+        DRJIT_STRUCT(Place, node, lower, width)
+    };
+
+    /// Expected candidates K, offset u of the points, next point k
+    Float expected, offset, k;
+    /// Remembered nodes, the deepest first; width 0 marks an empty entry
+    Place trail0, trail1;
+    DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1)
+
+    SystematicCursor(const Float &expected, const Float &u)
+        : expected(expected), offset(u), k(0.f), trail0(root(0.f)), trail1(root(0.f)) {}
+
+    Mask has_next() const { return holds(k, Float(1.f)); }
+
+    template <typename Rng>
+    Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at,
+                          Rng &rng) {
+        struct Descent {
+            Place place, trail0, trail1;
+            Float x, dither;
+            UInt32 visits;
+            DRJIT_STRUCT(Descent, place, trail0, trail1, x, dither, visits)
+        };
+
+        Mask remembered = trail0.width > 0.f;
+        Descent d{ dr::select(remembered, trail0, root(1.f)),
+                   dr::select(remembered, trail1, trail0),
+                   root(0.f),
+                   Float(0.f),
+                   rng.template next_float<Float>(),
+                   UInt32(0) };
+        d.x = inside(((k + offset) / expected - d.place.lower) / d.place.width);
+
+        loop(
+            d, [](const Descent &s) { return (s.place.node & kLeafBit) == 0u; },
+            [&](Descent &s) { descend(tree, at, s); },
+            "Light tree: descent");
+
+        trail0 = d.trail0;
+        trail1 = d.trail1;
+        k      = next_point(d.place.lower + d.place.width);
+        return { d.place.node & ~kLeafBit,
+                 dr::minimum(1.f, expected * d.place.width), true, d.visits };
+    }
+
+private:
+    static Place root(const Float &width) { return { UInt32(0), Float(0.f), width }; }
+    static Float inside(const Float &x) { return dr::clip(x, 0.f, kBelowOne); }
+
+    /// Does point k lie below `end`?
+    Mask holds(const Float &k, const Float &end) const {
+        return k + offset < expected * end;
+    }
+
+    /// First point at or beyond `end`, and at least one further than the current one
+    Float next_point(const Float &end) const {
+        return dr::maximum(k + 1.f, dr::ceil(dr::fmsub(expected, end, offset)));
+    }
+
+    template <typename Descent>
+    void descend(const TreeView<Float> &tree, const Receiver<Float> &at,
+                 Descent &s) const {
+        WideNodeView<Float> node(tree, s.place.node, true);
+        ChildChoice<Float> choice =
+            choose_child(child_probabilities(at, node.clusters), node.child, s.x);
+        Place child{ choice.child, dr::fmadd(choice.lower, s.place.width, s.place.lower),
+                     choice.probability * s.place.width };
+
+        // Remember this node if it holds a point beyond the child (the root needs no place)
+        Mask push = s.place.node != 0u && holds(next_point(child.lower + child.width),
+                                                s.place.lower + s.place.width);
+        s.trail1 = dr::select(push, s.trail0, s.trail1);
+        s.trail0 = dr::select(push, s.place, s.trail0);
+
+        s.x = inside((s.x - choice.lower) / choice.probability);
+        /* A descent magnifies the rounding of x. Where the interval becomes too small for a
+           second point, x is uniform in it, so low-order digits may be added. */
+        Mask single = expected * s.place.width > 1.f && expected * child.width <= 1.f;
+        Float x     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
+        s.x = dr::select(single, inside(x - dr::select(x >= 1.f, Float(1.f), 0.f)), s.x);
+        s.place = child;
+        s.visits += 1u;
+    }
+};
+
+/// The talk's two split functions: how fast the probability of splitting decays
+enum class SplitFunction { Near, Far };
+
+/// Lower limit of r/d: coincident lights (r = 0) can still be told apart
+constexpr float kMinSpread = 1e-3f;
+
+/**
+ * The talk's stochastic splitting: one number xi for the whole traversal; a node is split
+ * if xi < P(node), and below a node that is not split one light is chosen at random. With
+ * r half the diagonal of a node's box and d its distance,
+ *
+ *     near: P = g (r/d)^2 / (1 + g (r/d)^2),    far: P = g (r/d) / (1 + g (r/d)),
+ *
+ * readings of section 3, whose supplement is not public. The second extends further away.
+ * The traversal is stackless: a cut node's `escape` is where it goes on.
+ */
+template <typename Float> struct StochasticCursor {
+    using UInt32 = dr::uint32_array_t<Float>;
+    using Mask   = dr::mask_t<Float>;
+
+    Float rate, xi;
+    UInt32 node;
+    DRJIT_STRUCT(StochasticCursor, rate, xi, node)
+
+    SplitFunction function = SplitFunction::Near;
+
+    StochasticCursor(const Float &rate, const Float &u, SplitFunction function)
+        : rate(rate), xi(u), node(0), function(function) {}
+
+    Mask has_next() const { return node != kNone; }
+
+    template <typename Rng>
+    Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at, Rng &rng) {
+        struct Descent {
+            UInt32 node, resume;
+            Float x, probability;
+            Mask cut;
+            UInt32 visits;
+            DRJIT_STRUCT(Descent, node, resume, x, probability, cut, visits)
+        };
+        Descent d{ node, UInt32(0), rng.template next_float<Float>(), Float(1.f),
+                   Mask(false), UInt32(0) };
+        d.resume = node;
+        loop(
+            d, [](const Descent &s) { return (s.node & kLeafBit) == 0u; },
+            [&](Descent &s) {
+                BinaryView view(tree, s.node);
+                Mask leaf = view.right == kNone,
+                     stop = !s.cut && !(xi < split_probability(view, at));
+                // A leaf or a cut node: the traversal goes on behind it
+                s.resume = dr::select(!s.cut && (leaf || stop), view.escape, s.resume);
+                s.cut |= stop;
+
+                Float q_left = left_probability(tree, at, s.node, view.right, !leaf);
+                Mask left    = !s.cut || s.x < q_left;
+                Float q      = dr::select(left, q_left, 1.f - q_left);
+                Float x      = dr::select(left, s.x, s.x - q_left) / q;
+                Mask step    = s.cut && !leaf;
+                s.x           = dr::select(step, dr::clip(x, 0.f, kBelowOne), s.x);
+                s.probability = dr::select(step, s.probability * q, s.probability);
+                s.node        = dr::select(leaf, view.light | kLeafBit,
+                                           dr::select(left, s.node + 1u, view.right));
+                s.visits += 1u;
+            },
+            "Light tree: stochastic splitting");
+        node = d.resume;
+        return { d.node & ~kLeafBit, d.probability, d.probability > 0.f, d.visits };
+    }
+
+    /// Probability that `light` is a candidate, given this traversal's xi
+    Float inclusion_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
+                                const UInt32 &light, const Mask &active) const {
+        struct Descent {
+            UInt32 node;
+            Float probability;
+            Mask cut;
+            DRJIT_STRUCT(Descent, node, probability, cut)
+        };
+        Descent d{ dr::select(active, UInt32(0), kLeafBit), Float(1.f), Mask(false) };
+        loop(
+            d, [](const Descent &s) { return (s.node & kLeafBit) == 0u; },
+            [&](Descent &s) {
+                BinaryView view(tree, s.node);
+                Mask leaf = view.right == kNone;
+                s.cut |= !(xi < split_probability(view, at));
+                // Lights are numbered in the order of the leaves
+                Mask left    = light < BinaryView(tree, dr::select(leaf, 0u, view.right)).first;
+                Float q_left = left_probability(tree, at, s.node, view.right, !leaf);
+                Float q      = dr::select(left, q_left, 1.f - q_left);
+                s.probability =
+                    dr::select(s.cut && !leaf, s.probability * q, s.probability);
+                s.node = dr::select(
+                    leaf, kLeafBit, dr::select(left, s.node + 1u, view.right));
+            },
+            "Light tree: inclusion");
+        return d.probability;
+    }
+
+private:
+    /// A binary node, gathered
+    struct BinaryView {
+        dr::Array<Float, kBinaryNodeFloats> data;
+        UInt32 right, escape, light, first;
+
+        BinaryView(const TreeView<Float> &tree, const UInt32 &node)
+            : data(tree.template fetch<kBinaryNodeFloats>(tree.binary, node, true)),
+              right(bits(12)), escape(bits(13)), light(bits(14)), first(bits(15)) {}
+
+        UInt32 bits(size_t i) const { return dr::reinterpret_array<UInt32>(data.entry(i)); }
+    };
+
+    Float split_probability(const BinaryView &view, const Receiver<Float> &at) const {
+        Float d2(0.f), r2(0.f);
+        for (size_t i = 0; i < 3; ++i) {
+            Float low = view.data.entry(i), high = view.data.entry(3 + i);
+            d2 += dr::square(at.p.entry(i) - dr::clip(at.p.entry(i), low, high));
+            r2 += .25f * dr::square(high - low);
+        }
+        Float spread2 = dr::clip(r2 / d2, kMinSpread * kMinSpread, 1e12f);
+        Float g       = rate * (function == SplitFunction::Near ? spread2
+                                                                : dr::sqrt(spread2));
+        // The root's box holds all others, so P decreases with depth on every path
+        return dr::select(d2 > 0.f, g / (1.f + g), dr::select(rate > 0.f, Float(1.f), 0.f));
+    }
+
+    /// Probability of the left child, from the same h as the wide tree
+    Float left_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
+                           const UInt32 &node, const UInt32 &right,
+                           const Mask &interior) const {
+        Clusters<Float> clusters;
+        for (int i = 0; i < 3; ++i)
+            clusters.mean[i] = clusters.axis[i] = Four<Float>(0.f);
+        clusters.flux = Four<Float>(0.f);
+        clusters.variance = Four<Float>(1.f); // two slots are empty, not at distance 0
+        const UInt32 child[2]    = { node + 1u, right };
+        for (size_t slot = 0; slot < 2; ++slot) {
+            BinaryView view(tree, dr::select(interior, child[slot], 0u));
+            for (size_t i = 0; i < 3; ++i)
+                clusters.mean[i].entry(slot) = view.data.entry(6 + i);
+            clusters.variance.entry(slot) = view.data.entry(9);
+            clusters.flux.entry(slot)     = view.data.entry(10);
+            UInt32 axis                   = view.bits(11);
+            for (size_t i = 0; i < 3; ++i) {
+                auto quantized = dr::int32_array_t<Float>((axis >> (uint32_t) (10 * i)) & 1023u);
+                clusters.axis[i].entry(slot) = dr::fmadd(Float(quantized), 1.f / 511.5f, -1.f);
+            }
+        }
+        return child_probabilities(at, clusters).entry(0);
+    }
+};
+
+} // namespace manylights

@@ -1,0 +1,209 @@
+#pragma once
+
+/**
+ * How much light a cluster (h) or a single light (H) may send to a point.
+ *
+ * h steers the descent of the tree; H steers the first resampling. Neither has to be
+ * right, but both must be positive wherever the true contribution is not zero: this is
+ * the only condition for an unbiased image.
+ *
+ * Departure from the talk, which keeps h purely spatial: h also has the receiver's
+ * cosine and the first terms of the emission's spherical harmonics. At one descent a
+ * prototype measured a relative variance of 2.7 against 47 for flux / distance^2 (1,000
+ * lights, diffuse), for less than twice the time per node.
+ */
+
+#include "light.h"
+#include "loop.h"
+#include <mitsuba/core/vector.h>
+
+namespace manylights {
+
+/// What a shading point shows to the tree
+template <typename Float> struct Receiver {
+    using Vector3f = mitsuba::Vector<Float, 3>;
+    using Point3f  = mitsuba::Point<Float, 3>;
+    using Mask     = dr::mask_t<Float>;
+
+    Point3f p;
+    /// Unit normal on the side from which the point is seen
+    Vector3f n;
+    /// Can light arrive from behind as well?
+    Mask transmits;
+
+    DRJIT_STRUCT(Receiver, p, n, transmits)
+};
+
+/// The part of a wide node that the importance needs, for its four children
+template <typename Float> struct Clusters {
+    Four<Float> mean[3], variance, flux, axis[3];
+};
+
+/// Smallest factor by which the direction of emission may lower h
+constexpr float kEmissionFloor = .05f;
+/// Rounds the corner of the smooth cosine, as a fraction of distance^2
+constexpr float kCosineRounding = 1e-6f;
+
+/**
+ * h of four clusters at once:
+ *
+ *     w = mean - x,  e^2 = |w|^2 + variance
+ *     h = flux / e^2 * c / e * max(1 + 2 o + 5/8 (3 o^2 - |a|^2), floor)
+ *     c = (n.w + sqrt((n.w)^2 + variance + 1e-6 e^2)) / 2      smooth max(n.w, 0)
+ *     o = -a.w / e                                              a: mean emission axis
+ *
+ * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
+ * above it, and nothing ever becomes zero.
+ */
+template <typename Float>
+Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c) {
+    using F4 = Four<Float>;
+    F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
+    F4 e2  = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
+    F4 ie2 = dr::rcp(e2), ie = dr::sqrt(ie2);
+
+    F4 t = dr::fmadd(wx, F4(at.n.x()), dr::fmadd(wy, F4(at.n.y()), wz * at.n.z()));
+    t    = dr::select(at.transmits, dr::abs(t), t);
+    F4 cosine =
+        .5f * (t + dr::sqrt(dr::fmadd(t, t, dr::fmadd(kCosineRounding, e2, c.variance))));
+
+    F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * ie;
+    F4 k = dr::fmadd(c.axis[0], c.axis[0],
+                     dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+    F4 emission = dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - k), kEmissionFloor);
+    return c.flux * ie2 * cosine * ie * emission;
+}
+
+/// A row of the table, gathered
+template <typename Float> struct Row {
+    using UInt32   = dr::uint32_array_t<Float>;
+    using Mask     = dr::mask_t<Float>;
+    using Vector3f = mitsuba::Vector<Float, 3>;
+
+    dr::Array<Float, kRowFloats> data;
+
+    Float operator[](size_t i) const { return data.entry(i); }
+    Vector3f vector(size_t i) const {
+        return { data.entry(i), data.entry(i + 1), data.entry(i + 2) };
+    }
+    UInt32 bits(size_t i) const { return dr::reinterpret_array<UInt32>(data.entry(i)); }
+    UInt32 kind() const { return bits(kTag) & kTagKindMask; }
+    Mask is(LightKind k) const { return kind() == (uint32_t) k; }
+    Mask tabulated() const { return (bits(kTag) & kTagTabulated) != 0u; }
+    UInt32 emitter() const { return bits(kTag) >> kTagEmitterShift; }
+};
+
+/// The kinds of light that a scene has, as bits: what is absent is not even compiled
+struct KindSet {
+    uint32_t bits = 0;
+    bool has(LightKind kind) const { return (bits >> (uint32_t) kind) & 1; }
+    void insert(LightKind kind) { bits |= 1u << (uint32_t) kind; }
+    bool only(LightKind kind) const { return bits == 1u << (uint32_t) kind; }
+};
+
+/**
+ * Evaluate `f(kind)` for the kinds that occur and merge the results by the kind of the
+ * row. With one kind in the scene nothing is selected.
+ */
+template <typename Value, typename Float, typename F>
+Value by_kind(const Row<Float> &row, KindSet kinds, const F &f) {
+    Value result = dr::zeros<Value>();
+    for (uint32_t i = 0; i < kLightKinds; ++i) {
+        LightKind kind = (LightKind) i;
+        if (!kinds.has(kind))
+            continue;
+        if (kinds.only(kind))
+            return f(kind);
+        if constexpr (dr::is_jit_v<Float>)
+            result = dr::select(row.is(kind), f(kind), result);
+        else if (row.kind() == i)
+            return f(kind);
+    }
+    return result;
+}
+
+/// Fraction of the beam that a spot sends at `cos_theta` from its axis (as Mitsuba's)
+template <typename Float> Float spot_falloff(const Row<Float> &row, const Float &cos_theta) {
+    Float angle = dr::acos(dr::clip(cos_theta, -1.f, 1.f));
+    return dr::clip((row[6] - angle) * row[7], 0.f, 1.f);
+}
+
+/// Smallest cosine at the receiver that H assumes
+constexpr float kCosineFloor = 1e-5f;
+
+/// Where a light is, how far it extends and how bright it shines towards x
+template <typename Float> struct Appearance {
+    using Vector3f = mitsuba::Vector<Float, 3>;
+    /// From x to the light's centre, variance of its position
+    Vector3f w;
+    Float variance;
+    /// Intensity towards x; 0 only if nothing of the light can reach x
+    Float intensity;
+
+    DRJIT_STRUCT(Appearance, w, variance, intensity)
+};
+
+/// Intensity of a flat emitter of area vector `a` (length: area) seen along w
+template <typename Float, typename Vector3f>
+Float flat_intensity(const Vector3f &a, const Vector3f &w) {
+    return dr::maximum(-dr::dot(a, w), 0.f) * dr::rsqrt(dr::squared_norm(w) + 1e-30f);
+}
+
+template <typename Float>
+Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
+                             LightKind kind) {
+    using Vector3f = mitsuba::Vector<Float, 3>;
+    Vector3f origin = row.vector(0) - at.p;
+    switch (kind) {
+        case LightKind::Point:
+            return { origin, Float(0.f), Float(1.f) };
+        case LightKind::Spot: {
+            Float cos_theta =
+                -dr::dot(row.vector(3), origin) * dr::rsqrt(dr::squared_norm(origin));
+            return { origin, Float(0.f), spot_falloff(row, cos_theta) };
+        }
+        case LightKind::Triangle: {
+            Vector3f e1 = row.vector(3), e2 = row.vector(6),
+                     a = .5f * dr::cross(e1, e2), w = origin + (e1 + e2) * (1.f / 3.f);
+            // A smooth normal may lie on the other side of the plane: leave a floor
+            Float floor = dr::select(row.tabulated(), 0.f, .05f * dr::norm(a));
+            return { w, .16f * dr::norm(a), dr::maximum(flat_intensity<Float>(a, w), floor) };
+        }
+        case LightKind::Disk: {
+            Vector3f a = dr::Pi<Float> * dr::cross(row.vector(3), row.vector(6));
+            return { origin, .16f * dr::norm(a), flat_intensity<Float>(a, origin) };
+        }
+        case LightKind::Sphere:
+            return { origin, dr::square(row[3]), dr::Pi<Float> * dr::square(row[3]) };
+        case LightKind::Cylinder: {
+            Vector3f axis = row.vector(3), w = origin + .5f * axis;
+            Float length2 = dr::squared_norm(axis), radius2 = dr::square(row[6]);
+            // Silhouette: between the end's disk and the side's rectangle
+            return { w, length2 * (1.f / 12.f) + .5f * radius2,
+                     2.f * dr::sqrt(radius2 * length2) + dr::Pi<Float> * radius2 };
+        }
+        default:
+            return { origin, row[3], Float(1.f) };
+    }
+}
+
+/**
+ * H of one light: intensity towards x times the receiver's smooth cosine over distance^2,
+ * with the light's own extent instead of a cluster's.
+ *
+ * For a flat emitter of area A the distance^2 is d^2 + .08 A, half of its variance; a point
+ * on the surface then has no pole. It is zero only behind a flat emitter and outside of a
+ * spot's cone.
+ */
+template <typename Float>
+Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds) {
+    Appearance<Float> a = by_kind<Appearance<Float>>(
+        row, kinds, [&](LightKind kind) { return appearance(at, row, kind); });
+    Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
+    Float t  = dr::dot(at.n, a.w);
+    t        = dr::select(at.transmits, dr::abs(t), t);
+    Float cosine = .5f * (t + dr::sqrt(t * t + a.variance)) * inv_d;
+    return row[kLuminance] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d * inv_d;
+}
+
+} // namespace manylights

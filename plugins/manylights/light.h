@@ -1,0 +1,96 @@
+#pragma once
+
+/**
+ * The flat light table: one row of 64 bytes for every light that can be sampled.
+ *
+ * A *light* is the unit of selection: a point, a spot, one triangle of an emissive
+ * mesh, a sphere, a disk, a cylinder, or any other emitter of finite extent as a
+ * whole. Rows are filled once for each scene (light_table.h), put into the order of
+ * the tree's leaves (tree_builder.h) and read by the kernels as 16 consecutive floats
+ * (emission.h), without a virtual call.
+ *
+ * Plain C++, no Dr.Jit and no Mitsuba types: compiled once for all variants.
+ */
+
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+namespace manylights {
+
+/// How the geometry of a row is to be read
+enum class LightKind : uint32_t { Point, Spot, Triangle, Sphere, Disk, Cylinder, Other };
+
+/// Number of entries of \ref LightKind
+constexpr uint32_t kLightKinds = 7;
+
+/// Marks "no light", "no node" and "not a primitive of a light"
+constexpr uint32_t kNone = 0xffffffffu;
+
+/**
+ * One row of the table.
+ *
+ * kind     | geometry
+ * ---------|---------------------------------------------------------------------
+ * Point    | position[3]
+ * Spot     | position[3], axis[3], cutoff angle (rad), 1 / (cutoff - beam width)
+ * Triangle | vertex[3], edge1[3], edge2[3]; emits to the side of edge1 x edge2
+ * Sphere   | centre[3], radius, +1 (emits outwards) or -1 (inwards)
+ * Disk     | centre[3], u[3], v[3]: the unit disk under (u, v); emits along u x v
+ * Cylinder | base[3], axis[3] (of the cylinder's length), radius, +1 or -1
+ * Other    | mean position[3], variance of the position
+ *
+ * Radiance (areas) or intensity (points and spots) is `color` in RGB and monochrome
+ * variants; in spectral ones it is scale * D65(lambda) * S(color, lambda), with S
+ * Mitsuba's sigmoid upsampling of the coefficients `color`. A row that is not
+ * `tabulated` has its emission evaluated by its emitter; `color[0]` then holds the bits
+ * of the triangle's index and `color[1]` is 1 if its two edges were swapped (flipped
+ * normals), 0 if not.
+ */
+struct LightRow {
+    float geometry[9] = {};
+    float color[3]    = {};
+    /// Luminance of the mean radiance or intensity; for `Other`: flux / (4 pi)
+    float luminance = 0.f;
+    /// See above; 1 in RGB and monochrome variants
+    float scale = 1.f;
+    /// kind, flag and emitter index: see \ref make_tag
+    uint32_t tag = 0;
+    /// 4 * parent node + slot of this light in the parent (tree_builder.h)
+    uint32_t link = kNone;
+};
+
+constexpr size_t kRowFloats = 16;
+static_assert(sizeof(LightRow) == kRowFloats * sizeof(float));
+
+/// Offsets of the fields of a row, in floats
+enum RowField : size_t { kColor = 9, kLuminance = 12, kScale = 13, kTag = 14, kLink = 15 };
+
+constexpr uint32_t kTagKindMask     = 7;
+constexpr uint32_t kTagTabulated    = 8;
+constexpr uint32_t kTagEmitterShift = 4;
+
+/// Pack kind, "radiance is in the table" and the index into the scene's emitters
+constexpr uint32_t make_tag(LightKind kind, bool tabulated, uint32_t emitter) {
+    return (uint32_t) kind | (tabulated ? kTagTabulated : 0) |
+           (emitter << kTagEmitterShift);
+}
+
+/**
+ * What the tree has to know of a light (estimator: moments and mean emission axis).
+ *
+ * `flux` is the weight of the light in the tree. It is the emitted power but for
+ * spots, which get sqrt(power * 4 pi * peak intensity): a narrow beam matters more
+ * than its power where it falls, and less elsewhere.
+ */
+struct LightBounds {
+    float box_min[3], box_max[3];
+    /// Mean position and its variance (trace of the covariance / 3)
+    float mean[3], variance;
+    /// Mean emission axis: a unit vector for one-sided planar emitters and spots,
+    /// 0 for what shines in all directions
+    float axis[3];
+    float flux;
+};
+
+} // namespace manylights

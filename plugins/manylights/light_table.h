@@ -1,0 +1,733 @@
+#pragma once
+
+/**
+ * Scene emitters -> light table: reads every emitter once, on the host.
+ *
+ * Points, spots and area emitters of constant radiance become rows that the kernels can
+ * evaluate without a virtual call; each triangle of an emissive mesh is a light of its
+ * own. Textured radiance is integrated over each triangle by quadrature at the density of
+ * its texels. Other emitters of finite extent (projectors, textured or exotic shapes) are
+ * one light each, sampled through their own plugin after they were selected. Emitters at
+ * infinity stay out of the table, and so do those without power.
+ *
+ * Emitters and textures are read through Mitsuba's traversal interface, since the classes
+ * of its plugins have no headers.
+ */
+
+#include "light.h"
+#include <cmath>
+#include <cstring>
+#include <map>
+#include <mitsuba/core/qmc.h>
+#include <mitsuba/core/spectrum.h>
+#include <mitsuba/render/emitter.h>
+#include <mitsuba/render/mesh.h>
+#include <mitsuba/render/scene.h>
+#include <mitsuba/render/srgb.h>
+#include <mitsuba/render/texture.h>
+
+namespace manylights {
+
+namespace dr = drjit;
+
+/// The parameters of an object by name, children included ("intensity.value")
+class ParameterReader : public mitsuba::TraversalCallback {
+public:
+    explicit ParameterReader(const mitsuba::Object *object) {
+        const_cast<mitsuba::Object *>(object)->traverse(this);
+    }
+
+    /// The parameter as a `T`, or null if it is absent or of another type
+    template <typename T> const T *find(const std::string &name) const {
+        auto it = m_values.find(name);
+        return it != m_values.end() && *it->second.second == typeid(T)
+                   ? (const T *) it->second.first
+                   : nullptr;
+    }
+
+    const mitsuba::Object *object(const std::string &name) const {
+        auto it = m_objects.find(name);
+        return it != m_objects.end() ? it->second : nullptr;
+    }
+
+protected:
+    void put_value(std::string_view name, void *value, uint32_t,
+                   const std::type_info &type) override {
+        m_values[m_prefix + std::string(name)] = { value, &type };
+    }
+
+    void put_object(std::string_view name, mitsuba::Object *value, uint32_t) override {
+        if (!value)
+            return;
+        std::string prefix = m_prefix;
+        m_objects[prefix + std::string(name)] = value;
+        m_prefix += std::string(name) + ".";
+        value->traverse(this);
+        m_prefix = prefix;
+    }
+
+private:
+    std::string m_prefix;
+    std::map<std::string, std::pair<void *, const std::type_info *>> m_values;
+    std::map<std::string, mitsuba::Object *> m_objects;
+};
+
+/// Primitives of one emissive shape -> lights: light_of_primitive[first + primitive]
+template <typename Shape> struct ShapeLights {
+    const Shape *shape;
+    uint32_t first, count;
+};
+
+/// The table before the tree gives it its order
+template <typename Float, typename Spectrum> struct HostTable {
+    using Emitter = mitsuba::Emitter<Float, Spectrum>;
+    using Shape   = mitsuba::Shape<Float, Spectrum>;
+
+    std::vector<LightRow> rows;
+    std::vector<LightBounds> bounds;
+    /// Emitters without a place: environments, suns, directional lights
+    std::vector<const Emitter *> infinite;
+    std::vector<ShapeLights<Shape>> shapes;
+    /// Index into `rows`, kNone for a primitive that does not emit
+    std::vector<uint32_t> light_of_primitive;
+    /// Lights of any kind, those left out of the tree included
+    uint32_t light_count = 0;
+    /// Is there an emissive surface whose radiance is not in the table?
+    bool needs_emitter_eval = false;
+};
+
+template <typename Float, typename Spectrum> class LightTableReader {
+public:
+    MI_IMPORT_TYPES(Scene, Emitter, Shape, Mesh, Texture)
+    using Table = HostTable<Float, Spectrum>;
+
+    /// Read all emitters of a scene
+    static Table read(const Scene *scene) {
+        LightTableReader reader;
+        const auto &emitters = scene->emitters();
+        for (size_t i = 0; i < emitters.size(); ++i)
+            reader.add(emitters[i].get(), (uint32_t) i);
+        return std::move(reader.m_table);
+    }
+
+private:
+    /// Emission that does not vary over the emitter
+    struct Emission {
+        float color[3] = {};
+        float scale = 1.f, luminance = 0.f;
+        /// Can a row hold it? If not, only `luminance` is valid
+        bool tabulated = false;
+    };
+
+    void add(const Emitter *emitter, uint32_t index) {
+        m_emitter = index;
+        bool surface = has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface);
+        bool directional = has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaDirection);
+        std::string_view name = emitter->class_name();
+        if (surface && directional)
+            ++m_table.light_count; // Mitsuba never connects to it: no contribution
+        else if (surface && emitter->shape() && name == "AreaLight")
+            add_area(emitter, emitter->shape());
+        else if (name == "PointLight")
+            add_point(emitter);
+        else if (name == "SpotLight")
+            add_spot(emitter);
+        else if (directional || has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
+            ++m_table.light_count;
+            m_table.infinite.push_back(emitter);
+        } else
+            add_other(emitter);
+    }
+
+    // ---------------------------------------------------------------- Reading values
+
+    static float slice(const Float &value) { return (float) dr::slice(value, 0); }
+
+    template <typename T> static void copy3(const T &value, float out[3]) {
+        for (size_t i = 0; i < 3; ++i)
+            out[i] = slice(value.entry(i));
+    }
+
+    /// Constant emission from the texture that is the parameter `name` of `emitter`
+    static Emission read_emission(const ParameterReader &params, const std::string &name) {
+        Emission e;
+        const mitsuba::Object *texture = params.object(name);
+        std::string_view type = texture ? texture->class_name() : std::string_view();
+        using Color = mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
+        const Color *color = params.find<Color>(name + ".value");
+        if constexpr (mitsuba::is_spectral_v<Spectrum>) {
+            using Values = mitsuba::DynamicBuffer<Float>;
+            bool regular = type == "RegularSpectrum";
+            const Values *d65 = params.find<Values>(name + (regular ? ".values" : ".d65.values"));
+            bool has_color = type == "D65Spectrum" && color;
+            if (d65 && (has_color || (regular && is_d65(*d65)))) {
+                e.scale = scale_of_d65(*d65);
+                e.color[2] = std::numeric_limits<float>::infinity(); // sigmoid of 1
+                if (has_color)
+                    copy3(*color, e.color);
+                e.luminance = spectral_mean(e);
+                e.tabulated = true;
+            }
+        } else {
+            if (type == "SRGBReflectanceSpectrum" && color) {
+                for (size_t i = 0; i < color->size(); ++i)
+                    e.color[i] = slice(color->entry(i));
+                e.tabulated = true;
+            } else if (const Float *value = params.find<Float>(name + ".value");
+                       type == "UniformSpectrum" && value) {
+                std::fill_n(e.color, 3, slice(*value));
+                e.tabulated = true;
+            }
+            e.luminance = luminance(e.color);
+        }
+        return e;
+    }
+
+    static float luminance(const float color[3]) {
+        if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
+            return color[0];
+        else
+            return mitsuba::luminance(
+                mitsuba::Color<float, 3>(color[0], color[1], color[2]));
+    }
+
+    static float d65_value(size_t i) {
+        return (float) (mitsuba::d65_table[i] * MI_CIE_D65_NORMALIZATION);
+    }
+
+    template <typename Values> static float scale_of_d65(const Values &values) {
+        return (float) dr::slice(values, 0) / d65_value(0);
+    }
+
+    template <typename Values> static bool is_d65(const Values &values) {
+        if (dr::width(values) != MI_CIE_SAMPLES)
+            return false;
+        float scale = scale_of_d65(values);
+        for (size_t i = 1; i < MI_CIE_SAMPLES; ++i) {
+            float expected = scale * d65_value(i);
+            if (std::abs((float) dr::slice(values, i) - expected) > 1e-5f * expected)
+                return false;
+        }
+        return true;
+    }
+
+    /// Mean of scale * D65 * S over the visible range (the stage-3 target's luminance)
+    static float spectral_mean(const Emission &e) {
+        double sum = 0;
+        for (size_t i = 0; i < MI_CIE_SAMPLES; ++i) {
+            double w = MI_CIE_MIN + (MI_CIE_MAX - MI_CIE_MIN) * i / (MI_CIE_SAMPLES - 1.0);
+            double v = (e.color[0] * w + e.color[1]) * w + e.color[2],
+                   s = std::isinf(v) ? (v > 0 ? 1 : 0) : .5 + .5 * v / std::sqrt(1 + v * v);
+            sum += d65_value(i) * s;
+        }
+        return (float) (e.scale * sum / MI_CIE_SAMPLES);
+    }
+
+    // ------------------------------------------------------------- Points and spots
+
+    void add_point(const Emitter *emitter) {
+        ParameterReader params(emitter);
+        Emission e = read_emission(params, "intensity");
+        using Point3f = mitsuba::Point<Float, 3>;
+        const Point3f *position = params.find<Point3f>("position");
+        if (!position || !e.tabulated)
+            return add_other(emitter);
+        LightRow row = make_row(LightKind::Point, e);
+        copy3(*position, row.geometry);
+        LightBounds bounds = point_bounds(row.geometry);
+        bounds.flux = 4 * dr::Pi<float> * e.luminance;
+        add_light(row, bounds);
+    }
+
+    void add_spot(const Emitter *emitter) {
+        ParameterReader params(emitter);
+        Emission e = read_emission(params, "intensity");
+        const Float *cutoff_deg = params.find<Float>("cutoff_angle"),
+                    *beam_deg = params.find<Float>("beam_width");
+        float matrix[3][4];
+        bool textured = has_flag(emitter->flags(), mitsuba::EmitterFlags::SpatiallyVarying);
+        if (!e.tabulated || textured || !cutoff_deg || !beam_deg ||
+            !read_similarity(emitter->world_transform(), matrix))
+            return add_other(emitter);
+
+        float cutoff = dr::deg_to_rad(slice(*cutoff_deg)),
+              beam = dr::deg_to_rad(slice(*beam_deg));
+        LightRow row = make_row(LightKind::Spot, e);
+        float length = std::hypot(matrix[0][2], matrix[1][2], matrix[2][2]);
+        for (int i = 0; i < 3; ++i) {
+            row.geometry[i] = matrix[i][3];
+            row.geometry[3 + i] = matrix[i][2] / length;
+        }
+        row.geometry[6] = cutoff;
+        row.geometry[7] = std::min(1.f / (cutoff - beam), 1e10f);
+
+        LightBounds bounds = point_bounds(row.geometry);
+        std::copy_n(row.geometry + 3, 3, bounds.axis);
+        // sqrt(flux * 4 pi * peak), see LightBounds
+        float flux = 2 * dr::Pi<float> * e.luminance *
+                     (1 - .5f * (std::cos(beam) + std::cos(cutoff)));
+        bounds.flux = std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
+        add_light(row, bounds);
+    }
+
+    /// The upper 3x4 part of a transform, if it keeps angles
+    template <typename Transform>
+    static bool read_similarity(const Transform &transform, float matrix[3][4]) {
+        for (size_t i = 0; i < 3; ++i)
+            for (size_t j = 0; j < 4; ++j)
+                matrix[i][j] = slice(transform.matrix.entry(i, j));
+        float dots[6], scale = 0;
+        const int pairs[6][2] = { { 0, 0 }, { 1, 1 }, { 2, 2 }, { 0, 1 }, { 0, 2 }, { 1, 2 } };
+        for (int k = 0; k < 6; ++k) {
+            dots[k] = 0;
+            for (int i = 0; i < 3; ++i)
+                dots[k] += matrix[i][pairs[k][0]] * matrix[i][pairs[k][1]];
+            scale = std::max(scale, std::abs(dots[k]));
+        }
+        float error = std::max({ std::abs(dots[0] - dots[1]), std::abs(dots[0] - dots[2]),
+                                 std::abs(dots[3]), std::abs(dots[4]), std::abs(dots[5]) });
+        return scale > 0 && error < 1e-5f * scale;
+    }
+
+    // ---------------------------------------------------------------- Area emitters
+
+    void add_area(const Emitter *emitter, const Shape *shape) {
+        ParameterReader params(emitter);
+        Emission e = read_emission(params, "radiance");
+        uint32_t first = (uint32_t) m_table.light_of_primitive.size();
+        if (shape->is_mesh()) {
+            add_mesh(emitter, (const Mesh *) shape, e, params.object("radiance"));
+        } else {
+            std::string_view name = shape->class_name();
+            uint32_t light = (uint32_t) m_table.rows.size();
+            if (!e.tabulated)
+                add_other(emitter);
+            else if (name == "Sphere")
+                add_sphere(shape, e);
+            else if (name == "Disk")
+                add_disk(shape, e);
+            else if (name == "Cylinder")
+                add_cylinder(shape, e);
+            else
+                add_other(emitter);
+            bool added = m_table.rows.size() > light;
+            m_table.light_of_primitive.push_back(added ? light : kNone);
+        }
+        uint32_t count = (uint32_t) m_table.light_of_primitive.size() - first;
+        m_table.shapes.push_back({ shape, first, count });
+    }
+
+    /// Object-to-world matrix of a quadric
+    static void read_to_world(const Shape *shape, float m[3][4]) {
+        using Transform = typename mitsuba::CoreAliases<Float>::AffineTransform4f;
+        ParameterReader params(shape);
+        const Transform *to_world = params.find<Transform>("to_world");
+        if (!to_world)
+            throw std::runtime_error("manylights: the shape \"" + std::string(shape->id()) +
+                                     "\" does not expose its \"to_world\"");
+        for (size_t i = 0; i < 3; ++i)
+            for (size_t j = 0; j < 4; ++j)
+                m[i][j] = slice(to_world->matrix.entry(i, j));
+    }
+
+    static float column_length(const float m[3][4], int j) {
+        return std::hypot(m[0][j], m[1][j], m[2][j]);
+    }
+
+    static float determinant(const float m[3][4]) {
+        return m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) -
+               m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0]) +
+               m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
+    }
+
+    void add_sphere(const Shape *shape, const Emission &e) {
+        float m[3][4];
+        read_to_world(shape, m);
+        LightRow row = make_row(LightKind::Sphere, e);
+        float radius = column_length(m, 0);
+        for (int i = 0; i < 3; ++i)
+            row.geometry[i] = m[i][3];
+        row.geometry[3] = radius;
+        row.geometry[4] = shape->has_flipped_normals() ? -1.f : 1.f;
+
+        LightBounds bounds = point_bounds(row.geometry);
+        grow(bounds, radius);
+        bounds.variance = radius * radius / 3;
+        bounds.flux = 4 * dr::Pi<float> * radius * radius * dr::Pi<float> * e.luminance;
+        add_light(row, bounds);
+    }
+
+    void add_disk(const Shape *shape, const Emission &e) {
+        float m[3][4];
+        read_to_world(shape, m);
+        LightRow row = make_row(LightKind::Disk, e);
+        // A mirrored disk keeps its normal: swap the axes instead
+        int u = determinant(m) < 0 ? 1 : 0;
+        for (int i = 0; i < 3; ++i) {
+            row.geometry[i] = m[i][3];
+            row.geometry[3 + i] = m[i][u];
+            row.geometry[6 + i] = m[i][1 - u];
+        }
+        LightBounds bounds = point_bounds(row.geometry);
+        float area = set_axis(bounds, row.geometry + 3, row.geometry + 6) * dr::Pi<float>;
+        float radius = std::max(column_length(m, 0), column_length(m, 1));
+        grow(bounds, radius);
+        bounds.variance = radius * radius / 6;
+        bounds.flux = area * dr::Pi<float> * e.luminance;
+        add_light(row, bounds);
+    }
+
+    void add_cylinder(const Shape *shape, const Emission &e) {
+        float m[3][4];
+        read_to_world(shape, m);
+        LightRow row = make_row(LightKind::Cylinder, e);
+        float radius = column_length(m, 0), length = column_length(m, 2), center[3];
+        for (int i = 0; i < 3; ++i) {
+            row.geometry[i] = m[i][3];
+            row.geometry[3 + i] = m[i][2];
+            center[i] = m[i][3] + .5f * m[i][2];
+        }
+        row.geometry[6] = radius;
+        row.geometry[7] = shape->has_flipped_normals() ? -1.f : 1.f;
+
+        LightBounds bounds = point_bounds(center);
+        for (int i = 0; i < 3; ++i) {
+            bounds.box_min[i] = std::min(m[i][3], m[i][3] + m[i][2]);
+            bounds.box_max[i] = std::max(m[i][3], m[i][3] + m[i][2]);
+        }
+        grow(bounds, radius);
+        bounds.variance = (length * length / 12 + radius * radius) / 3;
+        bounds.flux = 2 * dr::Pi<float> * radius * length * dr::Pi<float> * e.luminance;
+        add_light(row, bounds);
+    }
+
+    // ----------------------------------------------------------------------- Meshes
+
+    void add_mesh(const Emitter *emitter, const Mesh *mesh, const Emission &constant,
+                  const mitsuba::Object *texture) {
+        std::vector<float> vertices = download<float>(mesh->vertex_positions_buffer());
+        std::vector<uint32_t> faces = download<uint32_t>(mesh->faces_buffer());
+        size_t count = faces.size() / 3;
+        /* With smooth normals the emitting side depends on the point: let the plugin decide
+           (it compares with the shading normal). */
+        std::vector<Emission> emission;
+        if (!constant.tabulated || mesh->has_vertex_normals())
+            emission = face_emission(emitter, mesh, constant, texture, count);
+
+        for (size_t f = 0; f < count; ++f) {
+            uint32_t light = (uint32_t) m_table.rows.size();
+            const Emission &e = emission.empty() ? constant : emission[f];
+            add_triangle(vertices, &faces[3 * f], e, (uint32_t) f,
+                         mesh->has_flipped_normals());
+            bool added = m_table.rows.size() > light;
+            m_table.light_of_primitive.push_back(added ? light : kNone);
+        }
+    }
+
+    template <typename T, typename Buffer> static std::vector<T> download(const Buffer &buffer) {
+        auto host = dr::migrate(buffer, JitBackend::None);
+        if constexpr (dr::is_jit_v<Float>)
+            dr::sync_thread();
+        return std::vector<T>(host.data(), host.data() + dr::width(buffer));
+    }
+
+    void add_triangle(const std::vector<float> &vertices, const uint32_t *face,
+                      const Emission &e, uint32_t face_index, bool flip) {
+        LightRow row = make_row(LightKind::Triangle, e);
+        const float *v0 = &vertices[3 * face[0]], *v1 = &vertices[3 * face[1]],
+                    *v2 = &vertices[3 * face[2]];
+        if (flip)
+            std::swap(v1, v2);
+        LightBounds bounds;
+        double square = 0;
+        for (int i = 0; i < 3; ++i) {
+            row.geometry[i] = v0[i];
+            row.geometry[3 + i] = v1[i] - v0[i];
+            row.geometry[6 + i] = v2[i] - v0[i];
+            bounds.box_min[i] = std::min({ v0[i], v1[i], v2[i] });
+            bounds.box_max[i] = std::max({ v0[i], v1[i], v2[i] });
+            double mean = ((double) v0[i] + v1[i] + v2[i]) / 3;
+            bounds.mean[i] = (float) mean;
+            square += (v0[i] - mean) * (v0[i] - mean) + (v1[i] - mean) * (v1[i] - mean) +
+                      (v2[i] - mean) * (v2[i] - mean);
+        }
+        bounds.variance = (float) (square / 36); // of a uniform point; trace / 3
+        float area = .5f * set_axis(bounds, row.geometry + 3, row.geometry + 6);
+        bounds.flux = area * dr::Pi<float> * e.luminance;
+        if (!e.tabulated) {
+            std::memcpy(&row.color[0], &face_index, sizeof(float));
+            row.color[1] = flip ? 1.f : 0.f;
+        }
+        add_light(row, bounds);
+    }
+
+    /// Mean emission of each face of a mesh
+    std::vector<Emission> face_emission(const Emitter *emitter, const Mesh *mesh,
+                                        const Emission &constant,
+                                        const mitsuba::Object *texture, size_t count) {
+        bool attribute = texture && texture->class_name() == "MeshAttribute";
+        std::vector<Emission> result(count);
+        if (constant.tabulated) {
+            for (Emission &e : result)
+                e.luminance = constant.luminance;
+        } else if (attribute) {
+            // Linear over a face: its mean is that of the corners, if it varies at all
+            read_attribute(emitter, mesh, result);
+        } else {
+            integrate_texture(emitter, mesh, texture, result);
+        }
+        return result;
+    }
+
+    /// Colour at one point of every face
+    using Color3 = std::array<float, 3>;
+    std::vector<Color3> evaluate(const Emitter *emitter, const Mesh *mesh,
+                                 const std::vector<uint32_t> &faces,
+                                 const std::vector<float> &b1,
+                                 const std::vector<float> &b2) const {
+        MI_IMPORT_CORE_TYPES()
+        size_t count = faces.size();
+        std::vector<Color3> result(count);
+        if constexpr (dr::is_jit_v<Float>) {
+            Color3fOf<Float> color = evaluate_color(
+                emitter, mesh, dr::load<UInt32>(faces.data(), count),
+                dr::load<Float>(b1.data(), count), dr::load<Float>(b2.data(), count));
+            for (int c = 0; c < 3; ++c) {
+                color.entry(c) += dr::zeros<Float>(count);
+                std::vector<float> host = download<float>(dr::detach(color.entry(c)));
+                for (size_t i = 0; i < count; ++i)
+                    result[i][c] = host[i];
+            }
+        } else {
+            for (size_t i = 0; i < count; ++i) {
+                auto color = evaluate_color(emitter, mesh, faces[i], b1[i], b2[i]);
+                result[i] = { color[0], color[1], color[2] };
+            }
+        }
+        return result;
+    }
+
+    template <typename F> using Color3fOf = mitsuba::Color<F, 3>;
+
+    /// Emitted colour along the normal; three copies of the mean of a spectrum
+    Color3fOf<Float> evaluate_color(const Emitter *emitter, const Mesh *mesh,
+                                    const dr::uint32_array_t<Float> &face, const Float &b1,
+                                    const Float &b2) const {
+        PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
+        pi.t = 1.f;
+        pi.prim_uv = { b1, b2 };
+        pi.prim_index = face;
+        pi.shape = mesh;
+        Ray3f ray = dr::zeros<Ray3f>();
+        SurfaceInteraction3f si =
+            mesh->compute_surface_interaction(ray, pi, +mitsuba::RayFlags::All, 0, true);
+        si.shape = mesh;
+        si.prim_index = face;
+        si.wi = { 0.f, 0.f, 1.f };
+        if constexpr (mitsuba::is_spectral_v<Spectrum>)
+            si.wavelengths = { 450.f, 520.f, 590.f, 650.f };
+        auto value = mitsuba::unpolarized_spectrum(emitter->eval(si, true));
+        if constexpr (mitsuba::is_rgb_v<Spectrum>)
+            return value;
+        else
+            return Color3fOf<Float>(dr::mean(value));
+    }
+
+    void read_attribute(const Emitter *emitter, const Mesh *mesh,
+                        std::vector<Emission> &result) const {
+        size_t count = result.size();
+        std::vector<uint32_t> faces(count);
+        for (size_t i = 0; i < count; ++i)
+            faces[i] = (uint32_t) i;
+        std::vector<Color3> corner[3];
+        for (int c = 0; c < 3; ++c) // just inside of the corners
+            corner[c] = evaluate(emitter, mesh, faces,
+                                 std::vector<float>(count, c == 1 ? .9f : .05f),
+                                 std::vector<float>(count, c == 2 ? .9f : .05f));
+        for (size_t i = 0; i < count; ++i) {
+            Emission &e = result[i];
+            bool constant = corner[0][i] == corner[1][i] && corner[0][i] == corner[2][i];
+            for (int c = 0; c < 3; ++c)
+                e.color[c] = constant ? corner[0][i][c]
+                                      : (corner[0][i][c] + corner[1][i][c] + corner[2][i][c]) / 3;
+            e.luminance = luminance(e.color);
+            // A spectrum cannot be recovered from its mean
+            e.tabulated = constant && !mitsuba::is_spectral_v<Spectrum> &&
+                          !mesh->has_vertex_normals();
+        }
+    }
+
+    /// Sub-triangles along each edge of a face: about two for each texel along it
+    static uint32_t subdivisions(const Mesh *mesh, const std::vector<float> &uv,
+                                 const uint32_t *face, ScalarVector2i resolution) {
+        if (!mesh->has_vertex_texcoords())
+            return 2;
+        float longest = 0;
+        for (int i = 0; i < 3; ++i) {
+            const float *a = &uv[2 * face[i]], *b = &uv[2 * face[(i + 1) % 3]];
+            longest = std::max({ longest, std::abs(a[0] - b[0]) * resolution.x(),
+                                 std::abs(a[1] - b[1]) * resolution.y() });
+        }
+        return (uint32_t) std::clamp(std::ceil(2 * longest), 2.f, 2048.f);
+    }
+
+    void integrate_texture(const Emitter *emitter, const Mesh *mesh,
+                           const mitsuba::Object *texture,
+                           std::vector<Emission> &result) const {
+        std::vector<uint32_t> indices = download<uint32_t>(mesh->faces_buffer());
+        std::vector<float> uv = download<float>(mesh->vertex_texcoords_buffer());
+        ScalarVector2i resolution(64, 64); // of procedural textures
+        if (auto *t = dynamic_cast<const Texture *>(texture); t && has_resolution(t))
+            resolution = t->resolution();
+
+        // Quadrature points in batches: centroids of n^2 equal sub-triangles
+        std::vector<uint32_t> faces;
+        std::vector<float> b1, b2;
+        constexpr size_t batch = 1 << 22;
+        std::vector<double> sum(result.size(), 0.0), points(result.size(), 0.0);
+        auto flush = [&] {
+            std::vector<Color3> colors = evaluate(emitter, mesh, faces, b1, b2);
+            for (size_t i = 0; i < faces.size(); ++i) {
+                sum[faces[i]] += luminance(colors[i].data());
+                points[faces[i]] += 1;
+            }
+            faces.clear();
+            b1.clear();
+            b2.clear();
+        };
+        for (uint32_t f = 0; f < result.size(); ++f) {
+            uint32_t n = subdivisions(mesh, uv, &indices[3 * f], resolution);
+            for (uint32_t i = 0; i < n; ++i)
+                for (uint32_t j = 0; i + j < n; ++j)
+                    for (uint32_t upper = 0; upper < 2 && i + j + upper < n; ++upper) {
+                        faces.push_back(f);
+                        b1.push_back((i + (1.f + upper) / 3.f) / n);
+                        b2.push_back((j + (1.f + upper) / 3.f) / n);
+                    }
+            if (faces.size() >= batch)
+                flush();
+        }
+        flush();
+        for (size_t f = 0; f < result.size(); ++f)
+            result[f].luminance = (float) (sum[f] / points[f]);
+    }
+
+    static bool has_resolution(const Texture *texture) {
+        try {
+            return dr::all(texture->resolution() > 0);
+        } catch (const std::exception &) {
+            return false; // procedural: not implemented
+        }
+    }
+
+    // --------------------------------------------------------------- Anything else
+
+    void add_other(const Emitter *emitter) {
+        Emission e;
+        e.luminance = emitted_power(emitter) / (4 * dr::Pi<float>);
+        LightRow row = make_row(LightKind::Other, e);
+        auto box = emitter->bbox();
+        LightBounds bounds;
+        double square = 0;
+        for (int i = 0; i < 3; ++i) {
+            bounds.box_min[i] = (float) box.min[i];
+            bounds.box_max[i] = (float) box.max[i];
+            bounds.mean[i] = .5f * ((float) box.min[i] + (float) box.max[i]);
+            bounds.axis[i] = 0;
+            double extent = (double) box.max[i] - box.min[i];
+            square += extent * extent / 12;
+        }
+        bounds.variance = (float) (square / 3);
+        std::copy_n(bounds.mean, 3, row.geometry);
+        row.geometry[3] = bounds.variance;
+        bounds.flux = 4 * dr::Pi<float> * e.luminance;
+        add_light(row, bounds);
+    }
+
+    /// Mean weight of rays that the emitter sends out; 1 if it cannot send any
+    static float emitted_power(const Emitter *emitter) {
+        MI_IMPORT_CORE_TYPES()
+        constexpr uint32_t count = 1024;
+        float power = 0;
+        try {
+            auto weight = [&](const auto &i) {
+                using UInt = std::decay_t<decltype(i)>;
+                Float a = Float(mitsuba::radical_inverse_2(UInt(i), UInt(0)));
+                Point2f u((Float(i) + .5f) / (float) count, a);
+                Point2f v(a, dr::fmadd(Float(i), .6180339887f, 0.f));
+                v.y() -= dr::floor(v.y());
+                auto [ray, spectrum] = emitter->sample_ray(0.f, .5f, u, v, true);
+                (void) ray;
+                return dr::mean(mitsuba::unpolarized_spectrum(spectrum));
+            };
+            if constexpr (dr::is_jit_v<Float>) {
+                power = slice(dr::mean(weight(dr::arange<UInt32>(count)) +
+                                       dr::zeros<Float>(count)));
+            } else {
+                for (uint32_t i = 0; i < count; ++i)
+                    power += weight(i) / count;
+            }
+            if constexpr (mitsuba::is_spectral_v<Spectrum>)
+                power /= MI_CIE_MAX - MI_CIE_MIN;
+        } catch (const std::exception &) {
+        }
+        /* A beam may have been missed, and a light that is left out is dark: the weight only
+           has to be positive. */
+        return power > 0 && std::isfinite(power) ? power : 1.f;
+    }
+
+    // ----------------------------------------------------------------- Common parts
+
+    LightRow make_row(LightKind kind, const Emission &e) const {
+        LightRow row;
+        std::copy_n(e.color, 3, row.color);
+        row.luminance = e.luminance;
+        row.scale = e.scale;
+        row.tag = make_tag(kind, e.tabulated, m_emitter);
+        return row;
+    }
+
+    static LightBounds point_bounds(const float position[3]) {
+        LightBounds bounds{};
+        std::copy_n(position, 3, bounds.box_min);
+        std::copy_n(position, 3, bounds.box_max);
+        std::copy_n(position, 3, bounds.mean);
+        return bounds;
+    }
+
+    static void grow(LightBounds &bounds, float radius) {
+        for (int i = 0; i < 3; ++i) {
+            bounds.box_min[i] -= radius;
+            bounds.box_max[i] += radius;
+        }
+    }
+
+    /// Set the emission axis to the direction of u x v; returns its length
+    static float set_axis(LightBounds &bounds, const float u[3], const float v[3]) {
+        float n[3] = { u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
+                       u[0] * v[1] - u[1] * v[0] };
+        float length = std::hypot(n[0], n[1], n[2]);
+        for (int i = 0; i < 3; ++i)
+            bounds.axis[i] = length > 0 ? n[i] / length : 0;
+        return length;
+    }
+
+    /// Lights without power, and degenerate ones, stay out
+    void add_light(const LightRow &row, const LightBounds &bounds) {
+        ++m_table.light_count;
+        bool finite = std::isfinite(bounds.flux) && std::isfinite(bounds.variance);
+        for (int i = 0; i < 3; ++i)
+            finite &= std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
+        if (!finite || !(bounds.flux > 0))
+            return;
+        bool hit_able = (row.tag & kTagKindMask) > (uint32_t) LightKind::Spot;
+        m_table.needs_emitter_eval |= hit_able && !(row.tag & kTagTabulated);
+        m_table.rows.push_back(row);
+        m_table.bounds.push_back(bounds);
+    }
+
+    Table m_table;
+    uint32_t m_emitter = 0;
+};
+
+} // namespace manylights

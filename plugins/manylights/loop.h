@@ -1,0 +1,74 @@
+#pragma once
+
+#include <drjit/autodiff.h>
+#include <drjit/jit.h>
+#include <drjit/packet.h>
+#include <drjit/while_loop.h>
+
+namespace manylights {
+
+namespace dr = drjit;
+
+/**
+ * Run `body(state)` while `cond(state)` holds: recorded once in JIT variants, a plain
+ * loop without copies of the state in scalar ones.
+ */
+template <typename State, typename Cond, typename Body>
+void loop(State &state, const Cond &cond, const Body &body, const char *name) {
+    if constexpr (std::is_same_v<std::decay_t<decltype(cond(state))>, bool>) {
+        (void) name;
+        while (cond(state))
+            body(state);
+    } else {
+        dr::tie(state) =
+            dr::while_loop(dr::make_tuple(std::move(state)), cond, body, name);
+    }
+}
+
+/// The value without its derivative, as a type that cannot carry one: choices are made with
+/// these, so that gradients flow through the chosen lights' values only
+template <typename T> auto plain(const T &value) { return dr::detach<false>(value); }
+
+/// Four numbers: an array of four JIT variables, or one SIMD register
+template <typename Float>
+using Four = std::conditional_t<dr::is_jit_v<Float>, dr::Array<Float, 4>,
+                                dr::Packet<dr::scalar_t<Float>, 4>>;
+
+/// Hard limit on the number of reservoirs: their state lives in registers
+constexpr uint32_t kMaxReservoirs = 64;
+
+/// A small array whose length is set at run time, in place of a heap allocation per sample
+template <typename T> class FixedArray {
+public:
+    FixedArray() = default;
+    FixedArray(size_t size, const T &value) : m_size(size) {
+        for (size_t i = 0; i < size; ++i)
+            m_data[i] = value;
+    }
+    FixedArray(const FixedArray &other) { *this = other; }
+    FixedArray &operator=(const FixedArray &other) {
+        m_size = other.m_size;
+        for (size_t i = 0; i < m_size; ++i)
+            m_data[i] = other.m_data[i];
+        return *this;
+    }
+    T &operator[](size_t i) { return m_data[i]; }
+    const T &operator[](size_t i) const { return m_data[i]; }
+
+private:
+    T m_data[kMaxReservoirs];
+    size_t m_size = 0;
+};
+
+/// The reservoirs' fields: an array of JIT variables, or plain memory
+template <typename T>
+using Slots = std::conditional_t<dr::is_jit_v<T>, dr::DynamicArray<T>, FixedArray<T>>;
+
+template <typename T> Slots<T> make_slots(size_t count, const T &value) {
+    if constexpr (dr::is_jit_v<T>)
+        return dr::full<Slots<T>>(value, count);
+    else
+        return Slots<T>(count, value);
+}
+
+} // namespace manylights

@@ -1,0 +1,86 @@
+#include "parameters.h"
+
+#include <sstream>
+#include <stdexcept>
+
+namespace manylights {
+
+namespace {
+
+using mitsuba::Properties;
+
+[[noreturn]] void refuse(const Properties &props, const std::string &name,
+                         const std::string &value, const std::string &allowed) {
+    throw std::runtime_error(std::string(props.plugin_name()) + ": the parameter \"" + name +
+                             "\" is " + value + ", but must be " + allowed + ".");
+}
+
+uint32_t read_count(const Properties &props, const std::string &name, uint32_t fallback,
+                    uint32_t low, uint32_t high) {
+    int64_t value = props.get<int64_t>(name, (int64_t) fallback);
+    if (value < (int64_t) low || value > (int64_t) high)
+        refuse(props, name, std::to_string(value),
+               "an integer from " + std::to_string(low) + " to " + std::to_string(high));
+    return (uint32_t) value;
+}
+
+float read_rate(const Properties &props, float fallback) {
+    const std::string name = "splitting_rate";
+    // XML has no spelling of infinity for a float, so a string is welcome too
+    if (props.has_property(name) && props.type(name) == Properties::Type::String) {
+        std::string text = props.get<std::string>(name);
+        if (text != "inf")
+            refuse(props, name, "\"" + text + "\"", "a number >= 0 or \"inf\"");
+        return std::numeric_limits<float>::infinity();
+    }
+    double value = props.get<double>(name, (double) fallback);
+    if (!(value >= 0)) // NaN as well
+        refuse(props, name, std::to_string(value), "a number >= 0 or \"inf\"");
+    return (float) value;
+}
+
+/// The index of a string parameter in the list of what is allowed
+size_t read_choice(const Properties &props, const std::string &name,
+                   const std::vector<std::string> &choices) {
+    std::string value = props.get<std::string>(name, choices[0]), allowed;
+    for (size_t i = 0; i < choices.size(); ++i) {
+        if (value == choices[i])
+            return i;
+        allowed += (i ? " or \"" : "\"") + choices[i] + "\"";
+    }
+    refuse(props, name, "\"" + value + "\"", allowed);
+}
+
+const std::vector<std::string> kMethods        = { "resampled_tree", "talk" };
+const std::vector<std::string> kSplitFunctions = { "near", "far" };
+
+} // namespace
+
+SamplingParameters read_parameters(const Properties &props) {
+    SamplingParameters p;
+    p.method         = (Method) read_choice(props, "method", kMethods);
+    p.splitting_rate = read_rate(props, p.splitting_rate);
+    p.reservoirs     = read_count(props, "reservoirs", p.reservoirs, 1, kMaxReservoirs);
+    p.shadow_rays    = read_count(props, "shadow_rays",
+                                  std::min(p.shadow_rays, p.reservoirs), 1, p.reservoirs);
+    p.bsdf_samples   = read_count(props, "bsdf_samples", p.bsdf_samples, 0, 1024);
+    p.split_function = (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
+    if (props.has_property("split_function") && p.method != Method::Talk)
+        refuse(props, "split_function", "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
+               "left out unless \"method\" is \"talk\"");
+    return p;
+}
+
+std::string to_string(const SamplingParameters &p) {
+    std::ostringstream oss;
+    oss << "method = " << kMethods[(size_t) p.method] << ",\n";
+    if (p.method == Method::Talk)
+        oss << "split_function = " << kSplitFunctions[(size_t) p.split_function] << ",\n";
+    oss << "splitting_rate = " << p.splitting_rate << ",\n"
+        << "reservoirs = " << p.reservoirs << ",\n"
+        << "shadow_rays = " << p.shadow_rays << ",\n"
+        << "bsdf_samples = " << p.bsdf_samples;
+    return oss.str();
+}
+
+} // namespace manylights

@@ -1,0 +1,38 @@
+#pragma once
+
+/**
+ * The parameters of the estimator, shared by all integrators: one reader, so that names,
+ * ranges and error messages cannot differ.
+ */
+
+#include "reservoirs.h"
+#include <cmath>
+#include <mitsuba/core/properties.h>
+
+namespace manylights {
+
+/// Where candidates come from
+enum class Method { ResampledTree, Talk };
+
+/// See the documentation of the plugin manylights_direct
+struct SamplingParameters {
+    Method method                = Method::ResampledTree;
+    SplitFunction split_function = SplitFunction::Near;
+    float splitting_rate         = 1.f;
+    uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
+
+    /// Expected number of candidates K, at least one
+    float expected_candidates() const {
+        return std::max(1.f, kCandidatesPerRate * splitting_rate);
+    }
+    /// Is K so large that every light is visited?
+    bool visits_all() const { return expected_candidates() > kMaxExpectedCandidates; }
+};
+
+/// Read and check the parameters; throws with the name, the value and what is allowed
+SamplingParameters read_parameters(const mitsuba::Properties &props);
+
+/// "name = value" lines
+std::string to_string(const SamplingParameters &params);
+
+} // namespace manylights

@@ -1,0 +1,253 @@
+#pragma once
+
+/**
+ * The lights of one scene, ready for the kernels: table and tree in device memory, the
+ * map from a hit to its light, and a fingerprint that tells when to build it anew.
+ */
+
+#include "emission.h"
+#include "light_table.h"
+#include <drjit/tensor.h>
+#include <mitsuba/core/timer.h>
+#include <unordered_map>
+
+namespace manylights {
+
+/// Collects the identity (JIT) or the values (scalar) of an object's parameters
+template <typename Float> class Fingerprint {
+public:
+    using Object = mitsuba::Object;
+
+    void add(const Object *object) {
+        mix((uint64_t) object);
+        if constexpr (dr::is_jit_v<Float>) {
+            // A changed parameter is a new variable. Holding on to them keeps the indices
+            // from being used again.
+            dr::scoped_set_flag guard(JitFlag::EnableObjectTraversal, true);
+            object->traverse_1_cb_ro(this, [](void *self, uint64_t index, const char *,
+                                              const char *) {
+                ((Fingerprint *) self)->hold((uint32_t) index);
+            });
+        } else {
+            ValueHash callback(*this);
+            const_cast<Object *>(object)->traverse(&callback);
+        }
+    }
+
+    bool operator==(const Fingerprint &other) const {
+        return m_hash == other.m_hash && m_held.size() == other.m_held.size();
+    }
+
+    Fingerprint() = default;
+    Fingerprint(Fingerprint &&) = default;
+    Fingerprint &operator=(Fingerprint &&other) {
+        std::swap(m_held, other.m_held);
+        std::swap(m_hash, other.m_hash);
+        return *this;
+    }
+    ~Fingerprint() {
+        for (uint32_t index : m_held)
+            jit_var_dec_ref(index);
+    }
+
+private:
+    void mix(uint64_t value) { // FNV-1a over 64-bit words
+        m_hash = (m_hash ^ value) * 0x100000001b3ull;
+        m_hash ^= m_hash >> 29;
+    }
+
+    void hold(uint32_t index) {
+        mix(index);
+        if (index) {
+            jit_var_inc_ref(index);
+            m_held.push_back(index);
+        }
+    }
+
+    void mix_floats(const float *data, size_t size) {
+        mix(size);
+        for (size_t i = 0; i < size; ++i) {
+            uint32_t bits;
+            std::memcpy(&bits, data + i, sizeof(bits));
+            mix(bits);
+        }
+    }
+
+    struct ValueHash : mitsuba::TraversalCallback {
+        Fingerprint &out;
+        explicit ValueHash(Fingerprint &out) : out(out) {}
+
+        void put_value(std::string_view, void *value, uint32_t,
+                       const std::type_info &type) override {
+            using Buffer = dr::DynamicArray<float>;
+            using Tensor = dr::Tensor<Buffer>;
+            using Core   = mitsuba::CoreAliases<float>;
+            if (type == typeid(float) || type == typeid(int) || type == typeid(uint32_t))
+                out.mix_floats((const float *) value, 1);
+            else if (type == typeid(mitsuba::Color<float, 3>) ||
+                     type == typeid(mitsuba::Point<float, 3>))
+                out.mix_floats((const float *) value, 3);
+            else if (type == typeid(typename Core::AffineTransform4f))
+                out.mix_floats((const float *) value, 12);
+            else if (type == typeid(Buffer))
+                out.mix_floats(((Buffer *) value)->data(), ((Buffer *) value)->size());
+            else if (type == typeid(Tensor))
+                out.mix_floats(((Tensor *) value)->data(), ((Tensor *) value)->size());
+        }
+
+        void put_object(std::string_view, Object *object, uint32_t) override {
+            if (object)
+                object->traverse(this);
+        }
+    };
+
+    std::vector<uint32_t> m_held;
+    uint64_t m_hash = 0xcbf29ce484222325ull;
+};
+
+template <typename Float, typename Spectrum> class SceneLights : public mitsuba::Object {
+public:
+    MI_IMPORT_TYPES(Scene, Emitter, EmitterPtr, Shape, ShapePtr)
+    using FloatD  = dr::detached_t<Float>;
+    using UInt32D = dr::uint32_array_t<FloatD>;
+    using MaskD   = dr::mask_t<FloatD>;
+    using Tree    = TreeView<FloatD>;
+
+    /// Numbers for users: `manylights tree`, `mi.traverse(integrator)`, `to_string()`
+    struct Statistics {
+        uint32_t lights = 0, lights_in_tree = 0, nodes = 0, depth = 0;
+        double bytes = 0;
+        float build_ms = 0;
+    };
+
+    SceneLights(const Scene *scene, bool keep_binary) {
+        mitsuba::Timer timer;
+        auto table = LightTableReader<Float, Spectrum>::read(scene);
+        LightTree tree = build_tree(table.bounds, keep_binary);
+        std::vector<LightRow> rows = ordered_rows(table, tree);
+
+        m_infinite = std::move(table.infinite);
+        m_needs_emitter_eval = table.needs_emitter_eval;
+        for (const LightRow &row : rows)
+            m_tree.kinds.insert((LightKind) (row.tag & kTagKindMask));
+        m_tree.light_count = (uint32_t) rows.size();
+        m_tree.nodes = upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
+        m_tree.binary =
+            upload((const float *) tree.binary.data(), tree.binary.size() * kBinaryNodeFloats);
+        m_tree.rows = upload((const float *) rows.data(), rows.size() * kRowFloats);
+        upload_map(table, tree);
+        if constexpr (dr::is_jit_v<Float>)
+            dr::eval(m_tree.nodes, m_tree.binary, m_tree.rows, m_shape_lights,
+                     m_light_of_primitive);
+
+        m_statistics.lights = table.light_count;
+        m_statistics.lights_in_tree = m_tree.light_count;
+        m_statistics.nodes = (uint32_t) tree.wide.size();
+        m_statistics.depth = tree.depth;
+        m_statistics.bytes = sizeof(float) * ((double) dr::width(m_tree.nodes) +
+                                              dr::width(m_tree.binary) + dr::width(m_tree.rows) +
+                                              dr::width(m_light_of_primitive) +
+                                              dr::width(m_shape_lights));
+        m_statistics.build_ms = (float) timer.value();
+    }
+
+    static Fingerprint<Float> fingerprint(const Scene *scene) {
+        Fingerprint<Float> result;
+        for (const auto &emitter : scene->emitters()) {
+            result.add(emitter.get());
+            if (emitter->shape())
+                result.add(emitter->shape());
+        }
+        return result;
+    }
+
+    const Tree &tree() const { return m_tree; }
+    const std::vector<const Emitter *> &infinite() const { return m_infinite; }
+    const Statistics &statistics() const { return m_statistics; }
+    /// Can a ray hit any light at all? If not, BSDF sampling cannot contribute
+    bool can_be_hit() const {
+        KindSet delta;
+        delta.insert(LightKind::Point);
+        delta.insert(LightKind::Spot);
+        return (m_tree.kinds.bits & ~delta.bits) != 0;
+    }
+    /// Is there an emissive surface whose radiance is not in the table?
+    bool needs_emitter_eval() const { return m_needs_emitter_eval; }
+
+    /// The light that a primitive of a shape is, or kNone
+    UInt32D find(const ShapePtr &shape, const UInt32D &primitive, const MaskD &active) const {
+        if constexpr (dr::is_jit_v<Float>) {
+            UInt32D id = plain(dr::reinterpret_array<dr::uint32_array_t<Float>>(shape));
+            using Pair = dr::Array<UInt32D, 2>;
+            MaskD known = active && id < (uint32_t) (dr::width(m_shape_lights) / 2);
+            Pair range = dr::gather<Pair>(m_shape_lights, id, known);
+            known &= range.y() > 0u;
+            UInt32D index = range.x() + dr::minimum(primitive, range.y() - 1u);
+            UInt32D light = dr::gather<UInt32D>(m_light_of_primitive, index, known);
+            return dr::select(known, light, kNone);
+        } else {
+            auto it = active ? m_shape_map.find(shape) : m_shape_map.end();
+            if (it == m_shape_map.end())
+                return kNone;
+            return m_light_of_primitive.data()[it->second.first +
+                                        std::min(primitive, it->second.count - 1)];
+        }
+    }
+
+    MI_DECLARE_CLASS(SceneLights)
+
+private:
+    using Table = HostTable<Float, Spectrum>;
+    using Storage = typename Tree::Storage;
+    using IndexStorage = std::conditional_t<dr::is_jit_v<Float>, UInt32D, dr::DynamicArray<UInt32D>>;
+
+    static std::vector<LightRow> ordered_rows(const Table &table, const LightTree &tree) {
+        std::vector<LightRow> rows(table.rows.size());
+        for (size_t i = 0; i < rows.size(); ++i) {
+            rows[i] = table.rows[tree.order[i]];
+            rows[i].link = tree.link[i];
+        }
+        return rows;
+    }
+
+    static Storage upload(const float *data, size_t size) {
+        // Never empty: kernels may refer to it with all lanes inactive
+        return size ? dr::load<Storage>(data, size) : dr::zeros<Storage>(kWideNodeFloats);
+    }
+
+    void upload_map(const Table &table, const LightTree &tree) {
+        std::vector<uint32_t> position(table.rows.size());
+        for (size_t i = 0; i < position.size(); ++i)
+            position[tree.order[i]] = (uint32_t) i;
+        std::vector<uint32_t> lights(table.light_of_primitive);
+        for (uint32_t &light : lights)
+            light = light == kNone ? kNone : position[light];
+        lights.push_back(kNone);
+        m_light_of_primitive = dr::load<IndexStorage>(lights.data(), lights.size());
+
+        if constexpr (dr::is_jit_v<Float>) {
+            std::vector<uint32_t> ranges(2, 0);
+            for (const auto &s : table.shapes) {
+                uint32_t id = jit_registry_id(s.shape);
+                if (ranges.size() < 2 * (id + 1))
+                    ranges.resize(2 * (id + 1), 0);
+                ranges[2 * id] = s.first;
+                ranges[2 * id + 1] = s.count;
+            }
+            m_shape_lights = dr::load<IndexStorage>(ranges.data(), ranges.size());
+        } else {
+            for (const auto &s : table.shapes)
+                if (s.count)
+                    m_shape_map[s.shape] = s;
+        }
+    }
+
+    Tree m_tree;
+    IndexStorage m_light_of_primitive, m_shape_lights;
+    std::unordered_map<const Shape *, ShapeLights<Shape>> m_shape_map;
+    std::vector<const Emitter *> m_infinite;
+    bool m_needs_emitter_eval = false;
+    Statistics m_statistics;
+};
+
+} // namespace manylights

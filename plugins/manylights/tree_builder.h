@@ -1,0 +1,88 @@
+#pragma once
+
+/**
+ * Builds the light tree: light bounds -> binary tree -> 4-wide nodes.
+ *
+ * The split minimizes the surface-area-orientation cost of Conty Estevez and Kulla,
+ * "Importance Sampling of Many Lights with Adaptive Tree Splitting" (2018), section 4.4,
+ * over 16 bins on each axis. Two departures:
+ *
+ * - M_A is the area of the box plus its squared diagonal: a string of lights has no
+ *   area, and every split of it would cost the same.
+ * - M_Omega is 4 - 3 |mean emission axis| (in units of pi): the same values as the
+ *   bounding cone's for aligned emitters and for all directions (1 and 4), and a sum
+ *   over the lights, so that bins are merged without trigonometry.
+ *
+ * Where the cost cannot decide (coincident lights) and below a depth of 64, the range
+ * is halved, so the depth is bounded. The same input gives the same tree, bit for bit.
+ *
+ * Plain C++: compiled once for all variants.
+ */
+
+#include "light.h"
+
+namespace manylights {
+
+/**
+ * A node of the default tree: the moments of its four children, as a structure of
+ * arrays so that one packet gather brings the same quantity of all four.
+ */
+struct WideNode {
+    /// Flux-weighted mean position of each child
+    float mean[3][4];
+    /// Flux-weighted variance of the position (trace / 3), the lights' extents included
+    float variance[4];
+    /// Flux as a fraction of the scene's; 0 marks an empty slot
+    float flux[4];
+    /// Flux-weighted mean emission axis: 10 bits for each coordinate, see \ref pack_axis
+    uint32_t axis[4];
+    /// Index of the child node, or kLeafBit | light
+    uint32_t child[4];
+    /// 4 * parent node + slot, kNone for the root; then padding to 128 bytes
+    uint32_t link, padding[3];
+};
+
+constexpr size_t kWideNodeFloats = 32;
+static_assert(sizeof(WideNode) == kWideNodeFloats * sizeof(float));
+
+/// Marks a child that is a light
+constexpr uint32_t kLeafBit = 0x80000000u;
+
+/**
+ * A node of the binary tree that the method `talk` walks, in depth-first order: the left
+ * child is the next node. `escape` is the node that follows this whole subtree.
+ */
+struct BinaryNode {
+    float box_min[3], box_max[3];
+    float mean[3], variance, flux;
+    uint32_t axis;
+    /// Right child (kNone for a leaf), the node after the subtree (kNone for the end),
+    /// the light (leaf only), the first light of the subtree
+    uint32_t right, escape, light, first;
+};
+
+constexpr size_t kBinaryNodeFloats = 16;
+static_assert(sizeof(BinaryNode) == kBinaryNodeFloats * sizeof(float));
+
+/// The tree and the order of the lights that it implies
+struct LightTree {
+    std::vector<WideNode> wide;
+    std::vector<BinaryNode> binary;
+    /// order[i] is the input index of light i: leaves are numbered in tree order
+    std::vector<uint32_t> order;
+    /// link[i] = 4 * node + slot at which light i hangs in the wide tree
+    std::vector<uint32_t> link;
+    /// Levels of the wide tree, 0 without lights
+    uint32_t depth = 0;
+};
+
+/**
+ * Build the tree over `lights`, all of which must have finite bounds and a positive,
+ * finite flux. `keep_binary` also keeps the binary nodes (method `talk`).
+ */
+LightTree build_tree(const std::vector<LightBounds> &lights, bool keep_binary);
+
+/// Quantize a vector of length <= 1 to 10 bits a coordinate
+uint32_t pack_axis(const float axis[3]);
+
+} // namespace manylights

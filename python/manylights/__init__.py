@@ -1,0 +1,27 @@
+"""Light-tree rendering of scenes with very many lights, as plugins for Mitsuba 3.
+
+Importing this package makes Mitsuba find the plugin ``manylights_direct``::
+
+    import mitsuba as mi
+    import manylights
+
+    mi.set_variant("llvm_ad_rgb")
+    image = mi.render(mi.load_file("scene.xml"))
+
+The order of ``import manylights`` and ``mi.set_variant`` does not matter: Mitsuba has one search
+path for the whole process and reads it whenever a scene asks for a plugin.
+
+``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.scenes`` generates
+scenes.
+"""
+
+from __future__ import annotations
+
+from manylights._plugins import REQUIRED_MITSUBA, plugin_dir, register
+
+register()
+
+from manylights import scenes  # noqa: E402  (needs the right Mitsuba, which register() checks)
+
+__version__ = "0.1.0"
+__all__ = ["REQUIRED_MITSUBA", "__version__", "plugin_dir", "scenes"]

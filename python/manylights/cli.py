@@ -1,0 +1,265 @@
+"""The command ``manylights``: render scenes, describe their light trees, show a demonstration."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+
+from manylights.errors import one_line
+
+#: Exit status of a command that could not do what was asked.
+FAILURE = 2
+
+RENDER_HELP = """\
+Renders an XML scene to an OpenEXR file and writes a PNG preview beside it.
+
+The same scene, variant, number of samples and seed give the same image. Scalar variants render all
+samples in one go. JIT variants do so up to 4 million samples for the whole image; longer renders
+are split into passes of a power of two of samples per pixel, at least four passes and at most 16
+million samples each. The first pass uses the seed, the others seeds derived from it, and each
+sample counts the same. Stratified samplers stratify within a pass. With a reconstruction filter
+wider than a pixel (anything but "box") threads add to the same pixel in varying order: the last
+bits of the image are then the same from run to run only with --threads 1.
+"""
+
+DEMO_HELP = """\
+Generates a city at night with thousands of lights, renders it, and says how long that took.
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return the exit status: 0, 2 for errors, 130 after Ctrl-C.
+
+    Args:
+        arguments: what follows the command's name. Default: what the process was started with.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        options.command(options)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if options.debug:
+            raise
+        print(f"manylights: {one_line(error)}", file=sys.stderr)
+        return FAILURE
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    from manylights import __version__
+
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser = argparse.ArgumentParser(prog="manylights", description=__doc__)
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    folder = commands.add_parser(
+        "plugin-dir", parents=[common], help='print the folder for: mitsuba -a "$(...)" scene.xml'
+    )
+    folder.set_defaults(command=_plugin_dir)
+    _add_render(commands, common)
+    _add_tree(commands, common)
+    _add_demo(commands, common)
+    return parser
+
+
+def _add_render(commands, common) -> None:
+    from manylights.integrators import PARAMETERS
+
+    known = "; ".join(f"{name}: {meaning}" for name, meaning in PARAMETERS.items())
+    render = commands.add_parser(
+        "render",
+        parents=[common],
+        help="render an XML scene",
+        description=RENDER_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    render.add_argument("scene", metavar="SCENE.xml")
+    render.add_argument("-o", "--output", required=True, metavar="OUT.exr", help="image to write")
+    render.add_argument(
+        "--spp", type=_positive, default=0, help="samples per pixel (default: the scene's)"
+    )
+    render.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    render.add_argument(
+        "--integrator",
+        metavar="NAME",
+        help="keep: the scene's own; any other name: that plugin "
+        "(default: manylights_direct instead of direct, any other stays)",
+    )
+    render.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"set a parameter of the integrator, any number of times ({known})",
+    )
+    _add_define(render)
+    _add_machine(render)
+    render.set_defaults(command=_render)
+
+
+def _add_tree(commands, common) -> None:
+    tree = commands.add_parser(
+        "tree", parents=[common], help="describe the lights of an XML scene and their tree"
+    )
+    tree.add_argument("scene", metavar="SCENE.xml")
+    tree.add_argument("--json", action="store_true", help="print one JSON object")
+    tree.add_argument("--variant", default="scalar_rgb", help="(default: scalar_rgb)")
+    _add_define(tree)
+    tree.set_defaults(command=_tree)
+
+
+def _add_demo(commands, common) -> None:
+    demo = commands.add_parser(
+        "demo", parents=[common], help="render a city with many lights", description=DEMO_HELP
+    )
+    demo.add_argument(
+        "-o", "--output", default="city", metavar="PREFIX", help="of both images (default: city)"
+    )
+    demo.add_argument(
+        "--lights", type=_positive, default=20000, help="number of lights (default: 20000)"
+    )
+    demo.add_argument(
+        "--spp", type=_positive, help="samples per pixel (default: 64, scalar variants 16)"
+    )
+    demo.add_argument("--width", type=_positive, default=640, help="in pixels (default: 640)")
+    demo.add_argument("--height", type=_positive, default=360, help="in pixels (default: 360)")
+    _add_machine(demo)
+    demo.set_defaults(command=_demo)
+
+
+def _add_define(parser) -> None:
+    parser.add_argument(
+        "-D",
+        "--define",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="value for a <default> parameter of the scene, any number of times",
+    )
+
+
+def _add_machine(parser) -> None:
+    parser.add_argument("--seed", type=_seed, default=0, help="0 to 4294967295 (default: 0)")
+    parser.add_argument(
+        "--variant", help="Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scalar_rgb)"
+    )
+    parser.add_argument("--threads", type=_positive, help="CPU threads (default: all)")
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
+    return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**32:
+        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to 4294967295")
+    return value
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _start(options) -> str:
+    """Set threads and variant as asked for, say which variant and why, and return it."""
+    import drjit as dr
+
+    from manylights import rendering
+
+    if options.threads:
+        dr.set_thread_count(options.threads)
+    variant = rendering.set_variant(options.variant)
+    if options.variant:
+        reason = "as asked for"
+    else:
+        reason = "libLLVM found" if variant == "llvm_ad_rgb" else "no libLLVM found"
+    _say(f"variant: {variant} ({reason})")
+    return variant
+
+
+def _plugin_dir(options) -> None:
+    import manylights
+
+    print(manylights.plugin_dir())
+
+
+def _render(options) -> None:
+    from manylights import integrators, rendering
+
+    target = rendering.check_output(options.output)
+    defines = integrators.parse_assignments(options.define, "-D")
+    settings = integrators.parse_assignments(options.set, "--set")
+    settings = {name: integrators.parse_value(text) for name, text in settings.items()}
+    _start(options)
+    loaded = rendering.load(options.scene, defines, options.integrator, settings)
+    for note in loaded.notes:
+        _say(note)
+    _render_to(loaded, target, options.sensor, options.spp, options.seed)
+
+
+def _render_to(loaded, target, sensor: int, spp: int, seed: int) -> float:
+    """Render with a progress bar, write the images, and return the seconds of the render."""
+    from manylights import rendering
+    from manylights.progress import run_with_bar
+
+    start = time.perf_counter()
+    bitmap = run_with_bar(
+        "rendering", lambda report: rendering.render(loaded, sensor, spp, seed, report)
+    )
+    seconds = time.perf_counter() - start
+    written, notes = rendering.write_images(bitmap, target)
+    for note in notes:
+        _say(note)
+    names = " and ".join(str(path) for path in written)
+    _say(f"rendered in {seconds:.1f} s, wrote {names}")
+    return seconds
+
+
+def _tree(options) -> None:
+    from manylights import integrators, rendering, tree
+
+    rendering.set_variant(options.variant)
+    defines = integrators.parse_assignments(options.define, "-D")
+    description = tree.describe(options.scene, defines)
+    print(json.dumps(description) if options.json else tree.format_report(description))
+
+
+def _demo(options) -> None:
+    import mitsuba as mi
+
+    from manylights import rendering, scenes, tree
+
+    target = rendering.check_output(f"{options.output}.exr")
+    variant = _start(options)
+    spp = options.spp or (16 if variant.startswith("scalar") else 64)
+    description = scenes.city(
+        options.lights,
+        kind="mixed",
+        seed=options.seed,
+        width=options.width,
+        height=options.height,
+        spp=spp,
+    )
+    loaded = rendering.LoadedScene(mi.load_dict(description), 1, [])
+    lights = sum(tree.count_kinds(loaded.scene).values())
+    _say(f"lights: {lights:,}")
+    seconds = _render_to(loaded, target, 0, spp, options.seed)
+    print(f"{lights:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""A progress bar with the estimated time left, and a render that Ctrl-C ends at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+#: Seconds between two looks at the state of the work.
+REFRESH = 0.1
+
+#: Exit status of a command that Ctrl-C ended, as shells have it: 128 + SIGINT.
+INTERRUPTED = 130
+
+
+class Estimate:
+    """Estimates the finished fraction between two reports, and the seconds left.
+
+    Work done in few large passes reports rarely. Between reports the estimate advances at the mean
+    speed so far, but never beyond the next report.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.clock, self.start = clock, clock()
+        self.last, self.step, self.reported_at = 0.0, 0.0, self.start
+
+    def report(self, fraction: float) -> None:
+        """Take note that ``fraction`` of the work, from 0 to 1, is done now."""
+        if fraction > self.last:
+            self.step = fraction - self.last
+            self.last, self.reported_at = fraction, self.clock()
+
+    def fraction(self) -> float:
+        """Return the estimated finished fraction, from 0 to 1."""
+        if self.last == 0.0:
+            return 0.0
+        speed = self.last / max(self.reported_at - self.start, 1e-6)
+        ahead = min(speed * (self.clock() - self.reported_at), self.step)
+        return min(self.last + ahead, 1.0)
+
+    def seconds_left(self) -> float | None:
+        """Return the estimated seconds to the end, None before the first report."""
+        if self.last == 0.0:
+            return None
+        speed = self.last / max(self.reported_at - self.start, 1e-6)
+        return (1.0 - self.fraction()) / speed
+
+
+def format_seconds(seconds: float | None) -> str:
+    """Return seconds as "1:02:03" or "2:03", "-:--" for None."""
+    if seconds is None:
+        return "-:--"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def run_with_bar(title: str, work: Callable[[Callable[[float], None]], Any]) -> Any:
+    """Run ``work(report)`` with a progress bar on stderr and return its result.
+
+    The work runs in a thread of its own: a compiled renderer cannot be interrupted, but the thread
+    that waits for it can. On Ctrl-C the process ends with status 130, without waiting for the work
+    and so without anything that would come after it. Without a terminal there is no bar.
+    """
+    estimate = Estimate()
+    outcome: dict[str, Any] = {}
+
+    def run() -> None:
+        try:
+            outcome["result"] = work(estimate.report)
+        except BaseException as error:
+            outcome["error"] = error
+
+    worker = threading.Thread(target=run, name="manylights-render", daemon=True)
+    worker.start()
+    try:
+        _show(title, estimate, worker)
+    except KeyboardInterrupt:
+        _end_interrupted()
+    if "error" in outcome:
+        raise outcome["error"]
+    return outcome["result"]
+
+
+def _show(title: str, estimate: Estimate, worker: threading.Thread) -> None:
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[left]} left"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=1.0, left=format_seconds(None))
+        while worker.is_alive():
+            worker.join(REFRESH)
+            left = format_seconds(estimate.seconds_left())
+            bar.update(task, completed=estimate.fraction(), left=left)
+        bar.update(task, completed=1.0, left=format_seconds(0.0))
+
+
+def _end_interrupted() -> None:
+    print("interrupted, nothing written", file=sys.stderr, flush=True)
+    os._exit(INTERRUPTED)

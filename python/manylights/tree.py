@@ -1,0 +1,95 @@
+"""Reports on the light tree of a scene: how many lights of which kind, how large the tree is."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import mitsuba as mi
+
+from manylights import integrators, rendering
+
+#: What the integrator publishes once the tree is built, in the order of the report.
+KEYS = ("lights", "lights_in_tree", "nodes", "depth", "bytes", "build_ms")
+
+#: Names of emitters by Mitsuba's class names; other classes are listed under the class name.
+KINDS = {
+    "PointLight": "point",
+    "SpotLight": "spot",
+    "Projector": "projector",
+    "DirectionalEmitter": "directional",
+    "DirectionalArea": "directionalarea",
+    "ConstantBackgroundEmitter": "constant",
+    "EnvironmentMapEmitter": "envmap",
+    "SunskyEmitter": "sunsky",
+    "TimedSunskyEmitter": "timed_sunsky",
+}
+
+
+def describe(path: str, defines: dict[str, str] | None = None) -> dict:
+    """Build the light tree of an XML scene and return what it is like.
+
+    The parameters of the scene's ``manylights_direct``, if it has one, decide which tree is built.
+
+    Args:
+        path: the XML file.
+        defines: values for the scene's ``<default>`` parameters. Default: none.
+
+    Returns:
+        The numbers named in ``KEYS`` (``bytes`` of memory, ``build_ms`` milliseconds) and
+        ``kinds``, a dictionary from the kind of light to its count.
+    """
+    with rendering.search_beside(path):
+        config, state = rendering.parse(path, defines or {})
+        parameters = integrators.parameters_of_ours(state)
+        scene = rendering.instantiate(config, state)
+    integrator = mi.load_dict({"type": integrators.OURS, **parameters})
+    integrator.render(scene, sensor=_tiny_sensor(), seed=0, spp=1)
+    values = mi.traverse(integrator)
+    return {
+        **{key: _number(values[key]) for key in KEYS},
+        "kinds": dict(count_kinds(scene)),
+    }
+
+
+def count_kinds(scene) -> Counter:
+    """Count the lights of a scene by kind; each triangle of an emissive mesh is one light."""
+    counts: Counter = Counter()
+    for emitter in scene.emitters():
+        shape = emitter.get_shape()
+        kind = KINDS.get(emitter.class_name(), emitter.class_name())
+        if shape is None:
+            counts[kind] += 1
+        elif shape.is_mesh():
+            counts[f"{_surface_kind(emitter)} triangle"] += shape.face_count()
+        else:
+            counts[f"{_surface_kind(emitter)} {shape.class_name().lower()}"] += 1
+    return counts
+
+
+def format_report(description: dict) -> str:
+    """Return what ``describe`` found as text, a line for each number."""
+    lines = [f"{count:>12,}  {kind}" for kind, count in sorted(description["kinds"].items())]
+    lines.append(f"{description['lights']:>12,}  lights")
+    outside = description["lights"] - description["lights_in_tree"]
+    lines.append(f"{description['lights_in_tree']:>12,}  in the tree ({outside:,} outside)")
+    lines.append(f"{description['nodes']:>12,}  nodes")
+    lines.append(f"{description['depth']:>12,}  depth")
+    lines.append(f"{description['bytes']:>12,}  bytes")
+    lines.append(f"{description['build_ms']:>12,.1f}  ms to build")
+    return "\n".join(lines)
+
+
+def _surface_kind(emitter) -> str:
+    return "directionalarea" if emitter.class_name() == "DirectionalArea" else "area"
+
+
+def _tiny_sensor():
+    """A camera of one pixel: rendering with it does little more than build the tree."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    return mi.load_dict({"type": "perspective", "film": film})
+
+
+def _number(value) -> int | float:
+    """Turn a number, or a one-element array of Dr.Jit, into a Python number."""
+    value = value if isinstance(value, (int, float)) else value[0]
+    return value if isinstance(value, int) else float(value)

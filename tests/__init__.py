@@ -1,0 +1,1 @@
+"""Tests of manylights; `tests/README.md` says how they are organised."""

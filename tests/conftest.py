@@ -1,0 +1,71 @@
+"""Fixtures shared by all tests: variants, the plugin, threads and the folder for failures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import pytest
+
+VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono_polarized")
+"""Variants that the tests run in by default."""
+
+
+def require_variant(name):
+    """Skip the test if this machine cannot run the variant, else make it the current one."""
+    if name not in mi.variants():
+        pytest.skip(f"this Mitsuba has no variant {name}")
+    if name.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip(f"{name} needs the LLVM library (on Debian: apt install libllvm15)")
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        pytest.skip(f"{name} needs an NVIDIA driver and GPU")
+    mi.set_variant(name)
+
+
+@pytest.fixture(params=VARIANTS)
+def variant(request):
+    """Each default variant in turn, set as the current one.
+
+    Other variants: `@pytest.mark.parametrize("variant", [...], indirect=True)`.
+    """
+    require_variant(request.param)
+    return request.param
+
+
+@pytest.fixture
+def llvm():
+    """The variant llvm_ad_rgb, or a skip."""
+    require_variant("llvm_ad_rgb")
+    return "llvm_ad_rgb"
+
+
+@pytest.fixture
+def scalar():
+    """The variant scalar_rgb."""
+    require_variant("scalar_rgb")
+    return "scalar_rgb"
+
+
+@pytest.fixture(scope="session")
+def plugin():
+    """The package manylights; importing it makes its plugins known to Mitsuba."""
+    import manylights
+
+    return manylights
+
+
+@pytest.fixture
+def thread_count():
+    """A function that sets the number of rendering threads; undone after the test."""
+    before = dr.thread_count()
+    yield dr.set_thread_count
+    dr.set_thread_count(before)
+
+
+@pytest.fixture(scope="session")
+def failure_folder():
+    """Folder for images of failed comparisons: $MANYLIGHTS_TEST_OUTPUT, or in .cache."""
+    default = Path(__file__).parents[1] / ".cache" / "failed-tests"
+    return Path(os.environ.get("MANYLIGHTS_TEST_OUTPUT", default))

@@ -1,0 +1,262 @@
+"""`manylights_direct` has the same mean as three independent estimates of direct light.
+
+Each comparison is one of image and tile means over seeds (`statistics_tools`), with as many
+samples as a bias of 2 % of the image mean needs to be found. The last tests plant such a bias.
+"""
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests import closed_form, light_scenes
+from tests import statistics_tools as tools
+from tests.conftest import require_variant
+from tests.references import ERROR, planned_images, reference_images, reference_variant
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+INFINITY = float("inf")
+
+# Mitsuba samples these lights wrongly (see light_scenes), its BSDF sampling is right.
+BSDF_ONLY = ("mesh-smooth",)
+
+# The exhaustive sum is checked against Mitsuba's choice of one light for all kinds of lights; for
+# materials, where that choice needs many samples, these are enough.
+CHECKED_MATERIALS = ("material-twosided", "material-roughplastic", "material-dielectric")
+
+
+# Scenes for the variants that are slow or differ in their spectra only.
+SUBSET = (
+    "points",
+    "spots",
+    "mesh-constant",
+    "mesh-face-colours",
+    "textured",
+    "projectors",
+    "sky",
+    "mixed",
+    "points-17",
+    "material-roughconductor",
+    "material-principled",
+    "material-roughdielectric",
+    "material-dielectric",
+    "material-mask",
+)
+
+# One-factor variations of the parameters, then combinations of extremes.
+PARAMETERS = (
+    {"splitting_rate": 0},
+    {"splitting_rate": 0.2},
+    {"splitting_rate": 4},
+    {"splitting_rate": INFINITY},
+    {"reservoirs": 1, "shadow_rays": 1},
+    {"reservoirs": 4, "shadow_rays": 1},
+    {"reservoirs": 8, "shadow_rays": 2},
+    {"reservoirs": 16, "shadow_rays": 1},
+    {"reservoirs": 16, "shadow_rays": 3},
+    {"reservoirs": 16, "shadow_rays": 4},
+    {"bsdf_samples": 0},
+    {"bsdf_samples": 2},
+    {"splitting_rate": 0, "reservoirs": 1, "shadow_rays": 1, "bsdf_samples": 0},
+    {"splitting_rate": INFINITY, "reservoirs": 4, "shadow_rays": 4, "bsdf_samples": 2},
+    {"splitting_rate": 4, "reservoirs": 8, "shadow_rays": 1, "bsdf_samples": 0},
+)
+METHODS = ("resampled_tree", "talk")
+
+
+def parameter_id(parameters):
+    """A readable test id: `reservoirs=4,shadow_rays=1`."""
+    return ",".join(f"{name}={value}" for name, value in parameters.items())
+
+
+def light_tree(**parameters):
+    """The integrator under test."""
+    return mi.load_dict({"type": "manylights_direct", **parameters})
+
+
+def reference_kinds(name, kinds):
+    """The kinds of references that are right for the scene."""
+    if name in BSDF_ONLY:
+        return ("bsdf",)
+    if name.startswith("material") and name not in CHECKED_MATERIALS:
+        return ("exhaustive",)
+    return kinds
+
+
+def tested_images(name, **parameters):
+    """Images of the integrator under test in the current variant."""
+    scene = light_scenes.load(name)
+    return planned_images(scene, light_tree(**parameters), ERROR["tested"], first_seed=0)
+
+
+def assert_unbiased(name, variant, kinds, **parameters):
+    """Compare the integrator with references of the given kinds."""
+    images = tested_images(name, **parameters)
+    assert (images >= 0).all()
+    matched = {
+        key: parameters[key] for key in ("bsdf_samples", "hide_emitters") if key in parameters
+    }
+    matched["bsdf_samples"] = min(matched.get("bsdf_samples", 1), 1)
+    for kind in reference_kinds(name, kinds):
+        reference = reference_images(name, kind, reference_variant(variant), **matched)
+        tools.assert_same_mean(images, reference, label=f"{name}, {variant}, {kind}")
+
+
+THREE_KINDS = ("exhaustive", "uniform", "power")
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in light_scenes.SCENES if reference_kinds(name, THREE_KINDS)[1:]]
+)
+def test_references_agree(llvm, name):
+    """The references have one mean; a disagreement would be the test's own mistake."""
+    first = reference_images(name, "exhaustive", llvm)
+    for kind in ("uniform", "power"):
+        tools.assert_same_mean(first, reference_images(name, kind, llvm), label=f"{name}, {kind}")
+
+
+@pytest.mark.parametrize("name", light_scenes.SCENES)
+def test_mean_equals_exhaustive_uniform_and_power_sampling(llvm, name):
+    """All lights and materials in llvm_ad_rgb against all references."""
+    assert_unbiased(name, llvm, THREE_KINDS)
+
+
+@pytest.mark.parametrize("name", light_scenes.SCENES)
+def test_mean_in_scalar_variant(scalar, name):
+    """All lights and materials in scalar_rgb."""
+    assert_unbiased(name, scalar, ("exhaustive",))
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_mono_polarized"], indirect=True)
+@pytest.mark.parametrize("name", SUBSET)
+def test_mean_in_other_variants(variant, name):
+    """Spectra with wavelengths, and Mueller matrices."""
+    assert_unbiased(name, variant, ("exhaustive",))
+
+
+@pytest.mark.parametrize("name", SUBSET)
+def test_mean_of_talk_method(llvm, name):
+    """The method of the talk has the same mean."""
+    assert_unbiased(name, llvm, ("exhaustive",), method="talk")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("parameters", PARAMETERS, ids=parameter_id)
+def test_mean_does_not_depend_on_parameters(llvm, parameters, method):
+    """Every setting trades noise for time and leaves the mean alone."""
+    assert_unbiased("mixed", llvm, ("exhaustive",), method=method, **parameters)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("parameters", PARAMETERS[::3], ids=parameter_id)
+def test_mean_does_not_depend_on_parameters_in_scalar_variant(scalar, parameters, method):
+    """The same for a glossy material in scalar_rgb."""
+    name = "material-roughplastic"
+    assert_unbiased(name, scalar, ("exhaustive",), method=method, **parameters)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_mean_with_hidden_emitters(variant):
+    """Hidden emitters disappear for the camera and still give light."""
+    hidden = {"hide_emitters": True}
+    assert_unbiased("visible-lights", variant, ("uniform",), **hidden)
+    shown, gone = (tested_images("visible-lights", **p) for p in ({}, hidden))
+    assert not tools.compare_means(shown, gone).passes
+
+
+@pytest.mark.parametrize("name", ["material-roughconductor", "material-roughdielectric", "mixed"])
+def test_mean_of_stokes_vector(name):
+    """The light keeps its polarization: all four Stokes components agree."""
+    require_variant("llvm_ad_mono_polarized")
+    scene = light_scenes.load(name)
+    ours, direct = (
+        mi.load_dict({"type": "stokes", "nested": {"type": integrator}})
+        for integrator in ("manylights_direct", "direct")
+    )
+    spp = 1024
+    images = tools.render_seeds(scene, ours, spp, range(16))
+    reference = tools.render_seeds(scene, direct, 4 * spp, range(100, 116))
+    assert images.shape[-1] > 3
+    tools.assert_same_mean(images, reference, power_channels=slice(0, 3), label=name)
+    if name.startswith("material"):
+        # The comparison means something: the light is polarized.
+        unpolarized = tools.compare_means(reference[..., 3:], 0 * reference[..., 3:])
+        assert not unpolarized.passes
+
+
+CAMERA = closed_form.Camera((0, -2, 3), (0, 0, 0), (0, 0, 1), 40, 6, 4)
+ALBEDO = (0.7, 0.5, 0.3)
+
+
+def plane_lights(count=40):
+    """Point and spot lights above the plane of the closed form."""
+    generator = np.random.default_rng(12)
+    lights = []
+    for index in range(count):
+        position = tuple(generator.uniform((-1.5, -1.5, 0.8), (1.5, 1.5, 2.0)))
+        light = closed_form.Light(position, tuple(generator.uniform(0.05, 1, 3)))
+        if index % 2:
+            axis = tuple(generator.normal(size=3) * 0.4 - (0, 0, 1))
+            cutoff = generator.uniform(20, 60)
+            light = dataclasses.replace(
+                light, axis=axis, cutoff_degrees=cutoff, beam_degrees=0.6 * cutoff
+            )
+        lights.append(light)
+    return lights
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_mean_equals_closed_form(variant, method):
+    """Point and spot lights above a plane, against quadrature without Mitsuba, pixel by pixel."""
+    lights = plane_lights()
+    exact = closed_form.plane_image(CAMERA, lights, ALBEDO)[np.newaxis]
+    scene = mi.load_dict(closed_form.scene_dict(CAMERA, lights, ALBEDO))
+    integrator = light_tree(method=method)
+    images = planned_images(scene, integrator, ERROR["tested"], first_seed=0)
+    comparison = tools.compare_means(images, exact, tile=1)
+    assert comparison.passes, comparison.message(f"closed form, {variant}")
+    assert comparison.detectable_bias() <= tools.BIAS
+
+
+def test_closed_form_agrees_with_mitsuba(llvm):
+    """The closed form reads camera and lights as Mitsuba does."""
+    lights = plane_lights()
+    exact = closed_form.plane_image(CAMERA, lights, ALBEDO)[np.newaxis]
+    scene = mi.load_dict(closed_form.scene_dict(CAMERA, lights, ALBEDO))
+    integrator = mi.load_dict({"type": "direct"})
+    images = planned_images(scene, integrator, ERROR["tested"], first_seed=0)
+    tools.assert_same_mean(images, exact, tile=1)
+
+
+def test_planted_bias_of_image_is_found(llvm):
+    """The images of the integrator, made 2 % brighter or darker, no longer pass."""
+    images = tested_images("mixed")
+    reference = reference_images("mixed", "exhaustive", llvm)
+    tools.assert_same_mean(images, reference)
+    for factor in (1.02, 1 / 1.02):
+        with pytest.raises(AssertionError, match="significance"):
+            tools.assert_same_mean(factor * images, reference)
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_planted_bias_of_one_light_is_found(variant):
+    """One light of the scene, brightened such that the image mean grows by 2 %, is found."""
+    name, light = "points", "point_7"
+    lights = light_scenes.SCENES[name]()
+    reference = reference_images(name, "exhaustive", reference_variant(variant))
+    only = {key: value for key, value in lights.items() if value_is_kept(key, light)}
+    share = planned_images(mi.load_dict(only), mi.load_dict({"type": "direct"}), 2e-3, 500_000)
+    factor = 1 + 0.02 * reference.mean() / share.mean()
+    colour = lights[light]["intensity"]["value"]
+    lights[light]["intensity"]["value"] = [factor * value for value in colour]
+    brighter = planned_images(mi.load_dict(lights), light_tree(), ERROR["tested"], first_seed=0)
+    with pytest.raises(AssertionError, match="significance"):
+        tools.assert_same_mean(brighter, reference)
+
+
+def value_is_kept(key, light):
+    """True for everything but the other point lights."""
+    return key == light or not key.startswith("point_")
