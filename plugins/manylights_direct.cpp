@@ -162,7 +162,8 @@ public:
             return { result, valid_ray };
 
         // Always the same dimensions of the sampler, so that stratification pays
-        manylights::LightSample<Float> u{ sampler->next_1d(active), sampler->next_1d(active),
+        manylights::LightSample<Float> u{ sampler->next_1d(active),
+                                          sampler->next_1d(active),
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
         Mask smooth  = active && has_flag(bsdf->flags(), BSDFFlags::Smooth);
@@ -182,7 +183,8 @@ public:
         std::ostringstream oss;
         oss << "ManyLightsDirect[" << std::endl
             << "  " << string::indent(manylights::to_string(m_params)) << "," << std::endl
-            << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << "," << std::endl
+            << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << ","
+            << std::endl
             << "  tree = " << string::indent(m_cache.to_string()) << std::endl
             << "]";
         return oss.str();

@@ -87,10 +87,13 @@ def exhaustive_class():
             scattered = si.to_world_mueller(scattered, -sample.wo, si.wi)
             light_si = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
             emitter = light_si.emitter(scene, active)
-            ds = mi.DirectionSample3f(scene, light_si, si)
-            delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-            light_pdf = dr.select(delta, 0, emitter.pdf_direction(si, ds, active))
             light = emitter.eval(light_si, active)
-            return multiply(self.weight(sample.pdf, light_pdf), scattered, light) & active
+            weight = 1
+            if self.emitter_samples:
+                ds = mi.DirectionSample3f(scene, light_si, si)
+                delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+                light_pdf = dr.select(delta, 0, emitter.pdf_direction(si, ds, active))
+                weight = self.weight(sample.pdf, light_pdf)
+            return multiply(weight, scattered, light) & active
 
     return Exhaustive

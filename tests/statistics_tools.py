@@ -36,11 +36,11 @@ directly) do not fail for the last digits.
 """
 
 
-def render_seeds(scene, integrator=None, spp=16, seeds=range(16)):
+def render_seeds(scene, integrator=None, spp=16, seeds=range(16), sensor=0):
     """Render `scene` once per seed; returns an array of shape (seeds, height, width, channels)."""
     images = []
     for seed in seeds:
-        image = mi.render(scene, integrator=integrator, spp=spp, seed=int(seed))
+        image = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=int(seed))
         images.append(np.array(image, dtype=np.float64))
     images = np.stack(images)
     return images if images.ndim == 4 else images[..., np.newaxis]
@@ -95,7 +95,13 @@ def welch(a, b, rounding=ROUNDING):
     """Welch tests of the means over axis 0. A sample of length one counts as an exact value."""
     variance_a, dof_a = variance_of_mean(a)
     variance_b, dof_b = variance_of_mean(b)
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    return welch_from_moments(
+        a.mean(axis=0), variance_a, dof_a, b.mean(axis=0), variance_b, dof_b, rounding
+    )
+
+
+def welch_from_moments(mean_a, variance_a, dof_a, mean_b, variance_b, dof_b, rounding=ROUNDING):
+    """Welch tests from means, variances of these means, and their degrees of freedom."""
     variance = variance_a + variance_b
     spread = variance_a**2 / dof_a + variance_b**2 / dof_b
     dof = np.divide(variance**2, spread, out=np.full_like(variance, 1e9), where=spread > 0)

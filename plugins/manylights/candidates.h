@@ -35,8 +35,8 @@ template <typename Float> struct Candidate {
 constexpr float kBelowOne = 0x1.fffffep-1f;
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
 constexpr float kMaxExpectedCandidates = 1 << 20;
-/// K for a splitting rate of 1 (24 measured best over the prototype's scenes)
-constexpr float kCandidatesPerRate = 24.f;
+/// K for a splitting rate of 1
+constexpr float kCandidatesPerRate = 8.f;
 
 template <typename Float> struct AllLights {
     using UInt32 = dr::uint32_array_t<Float>;
@@ -111,14 +111,13 @@ template <typename Float> struct SystematicCursor {
 
         loop(
             d, [](const Descent &s) { return (s.place.node & kLeafBit) == 0u; },
-            [&](Descent &s) { descend(tree, at, s); },
-            "Light tree: descent");
+            [&](Descent &s) { descend(tree, at, s); }, "Light tree: descent");
 
         trail0 = d.trail0;
         trail1 = d.trail1;
         k      = next_point(d.place.lower + d.place.width);
-        return { d.place.node & ~kLeafBit,
-                 dr::minimum(1.f, expected * d.place.width), true, d.visits };
+        return { d.place.node & ~kLeafBit, dr::minimum(1.f, expected * d.place.width),
+                 true, d.visits };
     }
 
 private:
@@ -140,15 +139,15 @@ private:
                  Descent &s) const {
         WideNodeView<Float> node(tree, s.place.node, true);
         ChildChoice<Float> choice =
-            choose_child(child_probabilities(at, node.clusters), node.child, s.x);
+            choose_child(child_probabilities(tree, at, node.clusters), node.child, s.x);
         Place child{ choice.child, dr::fmadd(choice.lower, s.place.width, s.place.lower),
                      choice.probability * s.place.width };
 
         // Remember this node if it holds a point beyond the child (the root needs no place)
         Mask push = s.place.node != 0u && holds(next_point(child.lower + child.width),
                                                 s.place.lower + s.place.width);
-        s.trail1 = dr::select(push, s.trail0, s.trail1);
-        s.trail0 = dr::select(push, s.place, s.trail0);
+        s.trail1  = dr::select(push, s.trail0, s.trail1);
+        s.trail0  = dr::select(push, s.place, s.trail0);
 
         s.x = inside((s.x - choice.lower) / choice.probability);
         /* A descent magnifies the rounding of x. Where the interval becomes too small for a
@@ -193,7 +192,8 @@ template <typename Float> struct StochasticCursor {
     Mask has_next() const { return node != kNone; }
 
     template <typename Rng>
-    Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at, Rng &rng) {
+    Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at,
+                          Rng &rng) {
         struct Descent {
             UInt32 node, resume;
             Float x, probability;
@@ -201,8 +201,8 @@ template <typename Float> struct StochasticCursor {
             UInt32 visits;
             DRJIT_STRUCT(Descent, node, resume, x, probability, cut, visits)
         };
-        Descent d{ node, UInt32(0), rng.template next_float<Float>(), Float(1.f),
-                   Mask(false), UInt32(0) };
+        Descent d{ node,       UInt32(0),   rng.template next_float<Float>(),
+                   Float(1.f), Mask(false), UInt32(0) };
         d.resume = node;
         loop(
             d, [](const Descent &s) { return (s.node & kLeafBit) == 0u; },
@@ -214,11 +214,11 @@ template <typename Float> struct StochasticCursor {
                 s.resume = dr::select(!s.cut && (leaf || stop), view.escape, s.resume);
                 s.cut |= stop;
 
-                Float q_left = left_probability(tree, at, s.node, view.right, !leaf);
-                Mask left    = !s.cut || s.x < q_left;
-                Float q      = dr::select(left, q_left, 1.f - q_left);
-                Float x      = dr::select(left, s.x, s.x - q_left) / q;
-                Mask step    = s.cut && !leaf;
+                Float q_left  = left_probability(tree, at, s.node, view.right, !leaf);
+                Mask left     = !s.cut || s.x < q_left;
+                Float q       = dr::select(left, q_left, 1.f - q_left);
+                Float x       = dr::select(left, s.x, s.x - q_left) / q;
+                Mask step     = s.cut && !leaf;
                 s.x           = dr::select(step, dr::clip(x, 0.f, kBelowOne), s.x);
                 s.probability = dr::select(step, s.probability * q, s.probability);
                 s.node        = dr::select(leaf, view.light | kLeafBit,
@@ -247,13 +247,14 @@ template <typename Float> struct StochasticCursor {
                 Mask leaf = view.right == kNone;
                 s.cut |= !(xi < split_probability(view, at));
                 // Lights are numbered in the order of the leaves
-                Mask left    = light < BinaryView(tree, dr::select(leaf, 0u, view.right)).first;
+                Mask left =
+                    light < BinaryView(tree, dr::select(leaf, 0u, view.right)).first;
                 Float q_left = left_probability(tree, at, s.node, view.right, !leaf);
                 Float q      = dr::select(left, q_left, 1.f - q_left);
                 s.probability =
                     dr::select(s.cut && !leaf, s.probability * q, s.probability);
-                s.node = dr::select(
-                    leaf, kLeafBit, dr::select(left, s.node + 1u, view.right));
+                s.node =
+                    dr::select(leaf, kLeafBit, dr::select(left, s.node + 1u, view.right));
             },
             "Light tree: inclusion");
         return d.probability;
@@ -269,7 +270,9 @@ private:
             : data(tree.template fetch<kBinaryNodeFloats>(tree.binary, node, true)),
               right(bits(12)), escape(bits(13)), light(bits(14)), first(bits(15)) {}
 
-        UInt32 bits(size_t i) const { return dr::reinterpret_array<UInt32>(data.entry(i)); }
+        UInt32 bits(size_t i) const {
+            return dr::reinterpret_array<UInt32>(data.entry(i));
+        }
     };
 
     Float split_probability(const BinaryView &view, const Receiver<Float> &at) const {
@@ -280,10 +283,10 @@ private:
             r2 += .25f * dr::square(high - low);
         }
         Float spread2 = dr::clip(r2 / d2, kMinSpread * kMinSpread, 1e12f);
-        Float g       = rate * (function == SplitFunction::Near ? spread2
-                                                                : dr::sqrt(spread2));
+        Float g = rate * (function == SplitFunction::Near ? spread2 : dr::sqrt(spread2));
         // The root's box holds all others, so P decreases with depth on every path
-        return dr::select(d2 > 0.f, g / (1.f + g), dr::select(rate > 0.f, Float(1.f), 0.f));
+        return dr::select(d2 > 0.f, g / (1.f + g),
+                          dr::select(rate > 0.f, Float(1.f), 0.f));
     }
 
     /// Probability of the left child, from the same h as the wide tree
@@ -293,22 +296,22 @@ private:
         Clusters<Float> clusters;
         for (int i = 0; i < 3; ++i)
             clusters.mean[i] = clusters.axis[i] = Four<Float>(0.f);
-        clusters.flux = Four<Float>(0.f);
+        clusters.flux     = Four<Float>(0.f);
         clusters.variance = Four<Float>(1.f); // two slots are empty, not at distance 0
-        const UInt32 child[2]    = { node + 1u, right };
+        const UInt32 child[2] = { node + 1u, right };
         for (size_t slot = 0; slot < 2; ++slot) {
             BinaryView view(tree, dr::select(interior, child[slot], 0u));
             for (size_t i = 0; i < 3; ++i)
                 clusters.mean[i].entry(slot) = view.data.entry(6 + i);
             clusters.variance.entry(slot) = view.data.entry(9);
             clusters.flux.entry(slot)     = view.data.entry(10);
-            UInt32 axis                   = view.bits(11);
-            for (size_t i = 0; i < 3; ++i) {
-                auto quantized = dr::int32_array_t<Float>((axis >> (uint32_t) (10 * i)) & 1023u);
-                clusters.axis[i].entry(slot) = dr::fmadd(Float(quantized), 1.f / 511.5f, -1.f);
-            }
+            auto axis =
+                dr::reinterpret_array<dr::int32_array_t<Float>>(view.data.entry(11));
+            for (int i = 0; i < 3; ++i)
+                clusters.axis[i].entry(slot) =
+                    Float((axis << (22 - 10 * i)) >> 22) * (1.f / 511.f);
         }
-        return child_probabilities(at, clusters).entry(0);
+        return child_probabilities(tree, at, clusters).entry(0);
     }
 };
 

@@ -4,7 +4,8 @@
  * Direct light at a shading point: candidates -> reservoirs -> shadow rays.
  *
  * Stage 1, candidates.h: N' lights, each with its inclusion probability p.
- * Stage 2, reservoirs.h: at most m lights, resampled by the heuristic H.
+ * Stage 2, reservoirs.h: at most m lights, resampled by the heuristic H. If there cannot be
+ *   more than m candidates, all are kept with C = 1 / p and nothing is resampled.
  * Stage 3: a point on each kept light, F = BSDF * emission * geometry * MIS weight without
  *   visibility; s of them are chosen by threshold-systematic sampling with target
  *   luminance(C F) and traced. (The talk draws s reservoirs; here the items of large
@@ -43,21 +44,24 @@ template <typename Float> Float mis_weight(const Float &pdf_a, const Float &pdf_
 template <typename Float, typename Spectrum> class DirectLight {
 public:
     MI_IMPORT_TYPES(Scene, Sampler, Emitter, EmitterPtr, BSDF, BSDFPtr, ShapePtr)
-    using Lights = SceneLights<Float, Spectrum>;
-    using FloatD = typename Lights::FloatD;
-    using UInt32D = typename Lights::UInt32D;
-    using MaskD = typename Lights::MaskD;
+    using Lights   = SceneLights<Float, Spectrum>;
+    using FloatD   = typename Lights::FloatD;
+    using UInt32D  = typename Lights::UInt32D;
+    using MaskD    = typename Lights::MaskD;
     using Point2fD = mitsuba::Point<FloatD, 2>;
-    using Rng = dr::PCG32<UInt32D>;
+    using Rng      = dr::PCG32<UInt32D>;
 
-    DirectLight(const Scene *scene, const Lights &lights, const SamplingParameters &params)
+    DirectLight(const Scene *scene, const Lights &lights,
+                const SamplingParameters &params)
         : m_scene(scene), m_lights(lights), m_params(params) {
-        // N <= m: no tree, every light is kept
-        m_all = lights.tree().light_count <= params.reservoirs;
-        m_slots = std::min(params.reservoirs, lights.tree().light_count);
-        if (!m_all && params.method == Method::ResampledTree)
-            m_slots = std::min(m_slots, (uint32_t) std::ceil(std::min(m_params.expected_candidates(), (float) kMaxReservoirs)));
-        m_items = m_slots + (uint32_t) lights.infinite().size();
+        uint32_t count = lights.tree().light_count;
+        // N <= m: no tree, every light is a candidate
+        m_all      = count <= params.reservoirs || params.visits_all();
+        float most = m_all ? (float) count : params.most_candidates();
+        m_keep_all = most <= (float) params.reservoirs;
+        m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
+        m_items    = m_slots + (uint32_t) lights.infinite().size();
+        m_choose   = m_items > params.shadow_rays;
     }
 
     /// Can BSDF sampling find light at all?
@@ -74,8 +78,8 @@ public:
         Shading shading{ si, bsdf, receiver(si, bsdf, active), u.point };
         LightSample<FloatD> ud{ plain(u.tree), plain(u.selection),
                                 Point2fD(plain(u.point.x()), plain(u.point.y())) };
-        Reservoirs<FloatD> kept = keep_lights(shading.at, ud, plain(active));
-        return trace_kept(shading, kept, ud.selection, active);
+        return trace_kept(shading, keep_lights(shading, ud, active), ud.selection,
+                          active);
     }
 
     /// Radiance that arrives along rays sampled from the BSDF
@@ -87,14 +91,14 @@ public:
         for (uint32_t i = 0; i < m_params.bsdf_samples; ++i) {
             auto [bs, value] = bsdf->sample(ctx, si, sampler->next_1d(active),
                                             sampler->next_2d(active), active);
-            value = si.to_world_mueller(value, -bs.wo, si.wi);
+            value            = si.to_world_mueller(value, -bs.wo, si.wi);
             Mask active_b =
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
             SurfaceInteraction3f hit =
                 m_scene->ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active_b);
             auto [radiance, light] = emitted(hit, active_b);
 
-            Mask delta = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
+            Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
             Float light_pdf = dr::select(
                 delta, 0.f, hit_density(si, bsdf, hit, light, u, active_b && !delta));
             Float pdf = bs.pdf * (float) m_params.bsdf_samples;
@@ -108,20 +112,21 @@ public:
      * Radiance emitted from a surface (or the environment, without a hit) against the ray
      * that found it, and the surface's light in the table.
      */
-    std::pair<Spectrum, UInt32D> emitted(const SurfaceInteraction3f &si, Mask active) const {
+    std::pair<Spectrum, UInt32D> emitted(const SurfaceInteraction3f &si,
+                                         Mask active) const {
         Spectrum result(0.f);
         UInt32D light(kNone);
         Mask valid = active && si.is_valid();
         if (m_lights.can_be_hit()) {
-            light = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
+            light      = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
             Mask found = light != kNone;
             if (dr::any_or<true>(found)) {
                 Row<FloatD> row = m_lights.tree().row(light, plain(found));
-                Mask tabulated = found && Mask(row.tabulated());
-                Mask front = Frame3f::cos_theta(si.wi) > 0.f;
+                Mask tabulated  = found && Mask(row.tabulated());
+                Mask front      = Frame3f::cos_theta(si.wi) > 0.f;
                 if (dr::any_or<true>(tabulated))
-                    result = mitsuba::depolarizer<Spectrum>(
-                        color(row, si.wavelengths) & (tabulated && front));
+                    result = mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) &
+                                                            (tabulated && front));
                 if (m_lights.needs_emitter_eval())
                     add_masked(result, found && !tabulated,
                                [&](Mask m) { return emitter_of(row)->eval(si, m); });
@@ -149,6 +154,20 @@ private:
         DRJIT_STRUCT(Sample, value, p)
     };
 
+    /// The lights that reach stage 3, at most one in each slot
+    struct Kept {
+        Slots<UInt32D> light;
+        /// Contribution weight C (0: empty), inclusion probability, target g
+        Slots<FloatD> weight, probability, target;
+        DRJIT_STRUCT(Kept, light, weight, probability, target)
+
+        explicit Kept(size_t slots, size_t items)
+            : light(make_slots<UInt32D>(slots, 0u)),
+              weight(make_slots<FloatD>(slots, 0.f)),
+              probability(make_slots<FloatD>(slots, 1.f)),
+              target(make_slots<FloatD>(items, 0.f)) {}
+    };
+
     // --------------------------------------------------------------- Stages 1 and 2
 
     static Receiver<FloatD> receiver(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
@@ -159,81 +178,156 @@ private:
                  plain(Mask(has_flag(flags, mitsuba::BSDFFlags::Transmission))) };
     }
 
-    Reservoirs<FloatD> keep_lights(const Receiver<FloatD> &at, const LightSample<FloatD> &u,
-                                   const MaskD &active) const {
-        Reservoirs<FloatD> kept(m_slots);
-        if (m_all) { // weight = importance = probability = 1
-            for (uint32_t i = 0; i < m_slots; ++i) {
-                kept.light[i] = i;
-                kept.weight[i] = 1.f;
-            }
-            return kept;
-        }
+    /// Choices are not differentiated: no gradient passes through here
+    Kept keep_lights(const Shading &shading, const LightSample<FloatD> &u,
+                     Mask active) const {
         dr::suspend_grad<Float> detached;
-        if (m_params.visits_all())
-            fill(kept, AllLights<FloatD>{ UInt32D(0), dr::opaque<UInt32D>(light_count()) }, at, u,
-                 active);
-        else if (m_params.method == Method::Talk)
-            fill(kept, talk_cursor(u.tree), at, u, active);
-        else
-            fill(kept, SystematicCursor<FloatD>(dr::opaque<FloatD>(m_params.expected_candidates()), u.tree), at, u,
-                 active);
-        return kept;
+        if (m_all)
+            return keep(
+                shading,
+                AllLights<FloatD>{ UInt32D(0), dr::opaque<UInt32D>(light_count()) }, u,
+                active);
+        if (m_params.method == Method::Talk)
+            return keep(shading, talk_cursor(u.tree), u, active);
+        FloatD expected = dr::opaque<FloatD>(m_params.expected_candidates());
+        return keep(shading, SystematicCursor<FloatD>(expected, u.tree), u, active);
+    }
+
+    template <typename Cursor>
+    Kept keep(const Shading &shading, const Cursor &cursor, const LightSample<FloatD> &u,
+              Mask active) const {
+        return m_keep_all ? keep_candidates(shading, cursor, u, active)
+                          : keep_resampled(shading,
+                                           resample(shading.at, cursor, u, plain(active)),
+                                           active);
     }
 
     uint32_t light_count() const { return m_lights.tree().light_count; }
 
     StochasticCursor<FloatD> talk_cursor(const FloatD &xi) const {
-        return { dr::opaque<FloatD>(m_params.splitting_rate), xi, m_params.split_function };
+        return { dr::opaque<FloatD>(m_params.splitting_rate), xi,
+                 m_params.split_function };
     }
 
-    /// Deal the candidates of a cursor to the reservoirs
+    /// No more candidates than slots: keep each with C = 1 / p
     template <typename Cursor>
-    void fill(Reservoirs<FloatD> &kept, const Cursor &cursor, const Receiver<FloatD> &at,
-              const LightSample<FloatD> &u, const MaskD &active) const {
+    Kept keep_candidates(const Shading &shading, const Cursor &cursor,
+                         const LightSample<FloatD> &u, Mask active) const {
         struct State {
             Cursor cursor;
-            Reservoirs<FloatD> kept;
+            Kept kept;
             Rng rng;
-            DRJIT_STRUCT(State, cursor, kept, rng)
-            State(const Cursor &c, Reservoirs<FloatD> &&k, Rng &&r)
-                : cursor(c), kept(std::move(k)), rng(std::move(r)) {}
+            UInt32D slot;
+            DRJIT_STRUCT(State, cursor, kept, rng, slot)
+            State(const Cursor &cursor, Kept &&kept, Rng &&rng)
+                : cursor(cursor), kept(std::move(kept)), rng(std::move(rng)), slot(0) {}
+        };
+        State state(cursor, Kept(m_slots, m_items), make_rng(u));
+        MaskD on = plain(active);
+        loop(
+            state,
+            [&](const State &s) { return on && s.cursor.has_next() && s.slot < m_slots; },
+            [&](State &s) {
+                auto candidate = s.cursor.next(m_lights.tree(), shading.at, s.rng);
+                FloatD weight  = dr::rcp(candidate.probability);
+                Kept &kept     = s.kept;
+                write_slot<UInt32D>(kept.light, s.slot, candidate.light, m_slots, true);
+                write_slot<FloatD>(kept.weight, s.slot, weight, m_slots, true);
+                write_slot<FloatD>(kept.probability, s.slot, candidate.probability,
+                                   m_slots, true);
+                if (m_choose)
+                    write_slot<FloatD>(kept.target, s.slot,
+                                       weight * light_target(shading, candidate.light,
+                                                             candidate.probability,
+                                                             s.slot, active),
+                                       m_items, true);
+                s.slot += 1u;
+            },
+            "Direct light: candidates");
+        return std::move(state.kept);
+    }
+
+    /// Stage 2: deal the candidates to m reservoirs
+    template <typename Cursor>
+    Reservoirs<FloatD> resample(const Receiver<FloatD> &at, const Cursor &cursor,
+                                const LightSample<FloatD> &u, const MaskD &active) const {
+        struct State {
+            Cursor cursor;
+            Reservoirs<FloatD> reservoirs;
+            Rng rng;
+            DRJIT_STRUCT(State, cursor, reservoirs, rng)
+            State(const Cursor &cursor, size_t count, Rng &&rng)
+                : cursor(cursor), reservoirs(count), rng(std::move(rng)) {}
         };
         const auto &tree = m_lights.tree();
         Dealing dealing =
             m_params.method == Method::Talk ? Dealing::Random : Dealing::Greedy;
-        State state(cursor, std::move(kept), make_rng(u));
+        State state(cursor, m_slots, make_rng(u));
         loop(
             state, [&](const State &s) { return active && s.cursor.has_next(); },
             [&](State &s) {
                 auto candidate = s.cursor.next(tree, at, s.rng);
                 FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds);
-                s.kept.add(candidate, h, m_slots, dealing, s.rng);
+                s.reservoirs.add(candidate, h, m_slots, dealing, s.rng);
             },
-            "Light tree: candidates");
-        kept = std::move(state.kept);
+            "Direct light: resampled candidates");
+        return std::move(state.reservoirs);
+    }
+
+    /// C = W / H, and the targets
+    Kept keep_resampled(const Shading &shading, const Reservoirs<FloatD> &reservoirs,
+                        Mask active) const {
+        struct State {
+            UInt32D slot;
+            Slots<FloatD> target;
+            DRJIT_STRUCT(State, slot, target)
+        };
+        Kept kept(m_slots, m_items);
+        kept.light       = reservoirs.light;
+        kept.probability = reservoirs.probability;
+        for (size_t i = 0; i < m_slots; ++i)
+            kept.weight[i] = reservoirs.weight[i] / reservoirs.importance[i];
+        if (!m_choose)
+            return kept;
+
+        State state{ UInt32D(0), kept.target };
+        MaskD on = plain(active);
+        loop(
+            state, [&](const State &s) { return on && s.slot < m_slots; },
+            [&](State &s) {
+                FloatD weight = read_slot<FloatD>(kept.weight, s.slot, m_slots);
+                FloatD target =
+                    light_target(shading, read_slot<UInt32D>(kept.light, s.slot, m_slots),
+                                 read_slot<FloatD>(kept.probability, s.slot, m_slots),
+                                 s.slot, active && weight > 0.f);
+                write_slot<FloatD>(s.target, s.slot, weight * target, m_items, true);
+                s.slot += 1u;
+            },
+            "Direct light: targets");
+        kept.target = state.target;
+        return kept;
     }
 
     /// Numbers that need no stratification, seeded with the bits of those that have it
     static Rng make_rng(const LightSample<FloatD> &u) {
         auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
-        auto [a, b] = mitsuba::sample_tea_32(bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
-                                             bits(u.point.y()) + bits(u.selection));
+        auto [a, b] =
+            mitsuba::sample_tea_32(bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
+                                   bits(u.point.y()) + bits(u.selection));
         using UInt64D = dr::uint64_array_t<UInt32D>;
         return Rng(1, UInt64D(a) + dr::sl<32>(UInt64D(b)));
     }
 
     // ------------------------------------------------------------------------ Stage 3
 
-    Spectrum trace_kept(const Shading &shading, const Reservoirs<FloatD> &kept,
-                        const FloatD &offset, Mask active) const {
+    Spectrum trace_kept(const Shading &shading, Kept kept, const FloatD &offset,
+                        Mask active) const {
         std::vector<Sample> infinite = sample_infinite(shading, active);
-        bool choose = m_items > m_params.shadow_rays;
-        Slots<FloatD> targets = make_slots<FloatD>(m_items, 0.f);
         FloatD tau(0.f);
-        if (choose) {
-            targets = stage3_targets(shading, kept, infinite, active);
-            tau = selection_threshold<FloatD>(targets, m_items, m_params.shadow_rays);
+        if (m_choose) {
+            for (size_t i = 0; i < infinite.size(); ++i)
+                kept.target[m_slots + i] = target(infinite[i].value);
+            tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays);
         }
 
         struct State {
@@ -243,15 +337,16 @@ private:
         };
         State state{ UInt32D(0), Spectrum(0.f) };
         uint32_t rays = std::min(m_params.shadow_rays, m_items);
+        MaskD on      = plain(active);
         loop(
-            state,
-            [&](const State &s) { return plain(active) && s.ray < dr::opaque<UInt32D>(rays); },
+            state, [&](const State &s) { return on && s.ray < rays; },
             [&](State &s) {
                 Selected<FloatD> chosen{ s.ray, FloatD(1.f), MaskD(true) };
                 FloatD boost(1.f);
-                if (choose) {
-                    chosen = select_item<FloatD>(targets, m_items, tau, (FloatD(s.ray) + offset) * tau);
-                    boost = dr::maximum(1.f, tau / chosen.target);
+                if (m_choose) {
+                    chosen = select_item<FloatD>(kept.target, m_items, tau,
+                                                 (FloatD(s.ray) + offset) * tau);
+                    boost  = dr::maximum(1.f, tau / chosen.target);
                 }
                 s.result += trace(shading, kept, infinite, chosen, active) * Float(boost);
                 s.ray += 1u;
@@ -261,21 +356,24 @@ private:
     }
 
     /// The chosen item's contribution, with visibility
-    Spectrum trace(const Shading &shading, const Reservoirs<FloatD> &kept,
+    Spectrum trace(const Shading &shading, const Kept &kept,
                    const std::vector<Sample> &infinite, const Selected<FloatD> &chosen,
                    Mask active) const {
         active &= chosen.valid;
         Sample sample = dr::zeros<Sample>();
         if (m_slots > 0) {
-            UInt32D slot = dr::minimum(chosen.item, m_slots - 1u);
-            Mask finite = active && chosen.item < m_slots;
-            FloatD weight = slot_weight(kept, slot);
-            finite &= weight > 0.f;
-            sample = sample_slot(shading, kept, slot, /* target_only = */ false, finite);
+            UInt32D slot  = dr::minimum(chosen.item, m_slots - 1u);
+            FloatD weight = read_slot<FloatD>(kept.weight, slot, m_slots);
+            Mask finite   = active && chosen.item < m_slots && weight > 0.f;
+            sample        = sample_light_point(
+                shading, read_slot<UInt32D>(kept.light, slot, m_slots),
+                read_slot<FloatD>(kept.probability, slot, m_slots), slot,
+                /* target_only = */ false, finite);
             sample.value = sample.value * Float(weight) & finite;
         }
         for (size_t i = 0; i < infinite.size(); ++i)
-            sample = dr::select(active && chosen.item == (uint32_t) (m_slots + i), infinite[i], sample);
+            sample = dr::select(active && chosen.item == (uint32_t) (m_slots + i),
+                                infinite[i], sample);
 
         active &= dr::any(mitsuba::unpolarized_spectrum(sample.value) != 0.f);
         if (dr::none_or<false>(active))
@@ -284,36 +382,12 @@ private:
         return sample.value & (active && !occluded);
     }
 
-    /// C = W / H of a reservoir, 0 if it is empty
-    FloatD slot_weight(const Reservoirs<FloatD> &kept, const UInt32D &slot) const {
-        return read_slot<FloatD>(kept.weight, slot, m_slots) /
-               read_slot<FloatD>(kept.importance, slot, m_slots);
-    }
-
-    /// g = luminance(C F) of every item
-    Slots<FloatD> stage3_targets(const Shading &shading, const Reservoirs<FloatD> &kept,
-                                 const std::vector<Sample> &infinite, Mask active) const {
-        dr::suspend_grad<Float> detached;
-        struct State {
-            UInt32D slot;
-            Slots<FloatD> targets;
-            DRJIT_STRUCT(State, slot, targets)
-        };
-        State state{ UInt32D(0), make_slots<FloatD>(m_items, 0.f) };
-        loop(
-            state,
-            [&](const State &s) { return plain(active) && s.slot < dr::opaque<UInt32D>(m_slots); },
-            [&](State &s) {
-                FloatD weight = slot_weight(kept, s.slot);
-                Mask filled = active && weight > 0.f;
-                Sample sample = sample_slot(shading, kept, s.slot, /* target_only = */ true, filled);
-                write_slot<FloatD>(s.targets, s.slot, weight * target(sample.value), m_items, true);
-                s.slot += 1u;
-            },
-            "Direct light: targets");
-        for (size_t i = 0; i < infinite.size(); ++i)
-            state.targets[m_slots + i] = target(infinite[i].value);
-        return state.targets;
+    /// luminance(F) of a light's point
+    FloatD light_target(const Shading &shading, const UInt32D &light,
+                        const FloatD &inclusion, const UInt32D &slot, Mask active) const {
+        return target(sample_light_point(shading, light, inclusion, slot,
+                                         /* target_only = */ true, active)
+                          .value);
     }
 
     /// Positive wherever the value is not zero; invalid values are never chosen
@@ -329,33 +403,35 @@ private:
     }
 
     /**
-     * F / p for the light of a reservoir. Lights that need their plugin get a guess of the
-     * same sign if only the target is wanted: their H times a typical BSDF value. The
-     * plugin is then called for the chosen lights only.
+     * F / p for a point on a light. Lights that need their plugin get a guess of the same
+     * sign if only the target is wanted: their H times a typical BSDF value. The plugin is
+     * then called for the chosen lights only.
      */
-    Sample sample_slot(const Shading &shading, const Reservoirs<FloatD> &kept,
-                       const UInt32D &slot, bool target_only, Mask active) const {
-        UInt32D light = read_slot<UInt32D>(kept.light, slot, m_slots);
-        FloatD inclusion = read_slot<FloatD>(kept.probability, slot, m_slots);
+    Sample sample_light_point(const Shading &shading, const UInt32D &light,
+                              const FloatD &inclusion, const UInt32D &slot,
+                              bool target_only, Mask active) const {
         const auto &tree = m_lights.tree();
-        Row<FloatD> row = tree.row(light, plain(active));
-        KindSet kinds = tree.kinds;
-        Sample result = dr::zeros<Sample>();
+        Row<FloatD> row  = tree.row(light, plain(active));
+        KindSet kinds    = tree.kinds;
+        Sample result    = dr::zeros<Sample>();
 
         bool others = kinds.has(LightKind::Other);
-        Mask other = others ? Mask(row.is(LightKind::Other)) : Mask(false);
-        Mask table = active && !other;
-        Point2f u = slot_point(shading.point, slot);
+        Mask other  = others ? Mask(row.is(LightKind::Other)) : Mask(false);
+        Mask table  = active && !other;
+        Point2f u   = slot_point(shading.point, slot);
         if (dr::any_or<true>(table) && !kinds.only(LightKind::Other))
             result = sample_row(shading, row, u, inclusion, target_only, table);
         if (others) {
             other &= active;
             if (target_only) {
                 constexpr float typical_bsdf = .2f;
-                Float guess = Float(light_importance(shading.at, row, kinds)) * typical_bsdf;
-                dr::masked(result.value, other) = mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
+                Float guess =
+                    Float(light_importance(shading.at, row, kinds)) * typical_bsdf;
+                dr::masked(result.value, other) =
+                    mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
             } else if (dr::any_or<true>(other)) {
-                Sample sample = sample_emitter(shading, emitter_of(row), u, Float(inclusion), other);
+                Sample sample =
+                    sample_emitter(shading, emitter_of(row), u, Float(inclusion), other);
                 dr::masked(result, other) = sample;
             }
         }
@@ -381,22 +457,23 @@ private:
         active &= point.pdf > 0.f;
 
         const SurfaceInteraction3f &si = shading.si;
-        Vector3f d = dr::normalize(Point3f(point.p) - si.p);
-        Spectrum emission =
-            mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) & Mask(row.tabulated()));
+        Vector3f d                     = dr::normalize(Point3f(point.p) - si.p);
+        Spectrum emission = mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) &
+                                                           Mask(row.tabulated()));
         if (m_lights.needs_emitter_eval()) {
             Mask eval = active && !row.tabulated();
             if (target_only)
                 dr::masked(emission, eval) = mitsuba::depolarizer<Spectrum>(
                     UnpolarizedSpectrum(Float(row[kLuminance])));
             else
-                add_masked(emission, eval,
-                           [&](Mask m) { return triangle_emission(si, row, point, d, m); });
+                add_masked(emission, eval, [&](Mask m) {
+                    return triangle_emission(si, row, point, d, m);
+                });
         }
         bool delta_only = !m_lights.can_be_hit();
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
-        Mask delta = row.kind() <= (uint32_t) LightKind::Spot;
-        Spectrum f = scatter(shading, d, light_pdf, delta, active);
+        Mask delta      = row.kind() <= (uint32_t) LightKind::Spot;
+        Spectrum f      = scatter(shading, d, light_pdf, delta, active);
         return { f * emission * Float(point.weight) & active, Point3f(point.p) };
     }
 
@@ -409,11 +486,12 @@ private:
                      const Mask &delta, Mask active) const {
         mitsuba::BSDFContext ctx;
         const SurfaceInteraction3f &si = shading.si;
-        Vector3f wo = si.to_local(d);
+        Vector3f wo                    = si.to_local(d);
         if (!needs_bsdf_samples())
-            return si.to_world_mueller(shading.bsdf->eval(ctx, si, wo, active), -wo, si.wi);
+            return si.to_world_mueller(shading.bsdf->eval(ctx, si, wo, active), -wo,
+                                       si.wi);
         auto [value, pdf] = shading.bsdf->eval_pdf(ctx, si, wo, active);
-        value = si.to_world_mueller(value, -wo, si.wi);
+        value             = si.to_world_mueller(value, -wo, si.wi);
         Float weight = mis_weight<Float>(light_pdf, pdf * (float) m_params.bsdf_samples);
         return value * dr::detach(dr::select(delta, 1.f, weight));
     }
@@ -431,7 +509,8 @@ private:
     std::vector<Sample> sample_infinite(const Shading &shading, Mask active) const {
         std::vector<Sample> samples;
         for (const Emitter *emitter : m_lights.infinite()) {
-            Point2f u = slot_point(shading.point, UInt32D(m_slots + (uint32_t) samples.size()));
+            Point2f u =
+                slot_point(shading.point, UInt32D(m_slots + (uint32_t) samples.size()));
             samples.push_back(sample_emitter(shading, emitter, u, Float(1.f), active));
         }
         return samples;
@@ -441,21 +520,27 @@ private:
 
     EmitterPtr emitter_of(const Row<FloatD> &row) const {
         using UInt32 = dr::uint32_array_t<Float>;
-        return dr::gather<EmitterPtr>(m_scene->emitters_dr(), UInt32(row.emitter()), Mask(true));
+        return dr::gather<EmitterPtr>(m_scene->emitters_dr(), UInt32(row.emitter()),
+                                      Mask(true));
     }
 
     /// Add f(mask) where the mask is set; scalar variants do not call f otherwise
-    template <typename F> static void add_masked(Spectrum &result, Mask mask, const F &f) {
+    template <typename F>
+    static void add_masked(Spectrum &result, Mask mask, const F &f) {
         if (dr::any_or<true>(mask))
             dr::masked(result, mask) = result + f(mask);
     }
 
     /// Radiance or intensity of a tabulated row
-    static UnpolarizedSpectrum color(const Row<FloatD> &row, const Wavelength &wavelengths) {
+    static UnpolarizedSpectrum color(const Row<FloatD> &row,
+                                     const Wavelength &wavelengths) {
         if constexpr (mitsuba::is_spectral_v<Spectrum>) {
-            dr::Array<Float, 3> coefficients(row[kColor], row[kColor + 1], row[kColor + 2]);
-            return Float(row[kScale]) * mitsuba::cie_d65<UnpolarizedSpectrum>(wavelengths) *
-                   mitsuba::srgb_model_eval<UnpolarizedSpectrum>(coefficients, wavelengths);
+            dr::Array<Float, 3> coefficients(row[kColor], row[kColor + 1],
+                                             row[kColor + 2]);
+            return Float(row[kScale]) *
+                   mitsuba::cie_d65<UnpolarizedSpectrum>(wavelengths) *
+                   mitsuba::srgb_model_eval<UnpolarizedSpectrum>(coefficients,
+                                                                 wavelengths);
         } else {
             UnpolarizedSpectrum result;
             for (size_t i = 0; i < result.size(); ++i)
@@ -468,15 +553,15 @@ private:
     Spectrum triangle_emission(const SurfaceInteraction3f &from, const Row<FloatD> &row,
                                const LightPoint<FloatD> &point, const Vector3f &d,
                                Mask active) const {
-        EmitterPtr emitter = emitter_of(row);
+        EmitterPtr emitter           = emitter_of(row);
         PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        MaskD flipped = row[kColor + 1] > 0.f;
-        pi.valid = active;
-        pi.t = dr::norm(Point3f(point.p) - from.p);
-        pi.prim_uv = Point2f(dr::select(flipped, point.uv.y(), point.uv.x()),
-                             dr::select(flipped, point.uv.x(), point.uv.y()));
+        MaskD flipped                = row[kColor + 1] > 0.f;
+        pi.valid                     = active;
+        pi.t                         = dr::norm(Point3f(point.p) - from.p);
+        pi.prim_uv    = Point2f(dr::select(flipped, point.uv.y(), point.uv.x()),
+                                dr::select(flipped, point.uv.x(), point.uv.y()));
         pi.prim_index = row.bits(kColor);
-        pi.shape = emitter->shape();
+        pi.shape      = emitter->shape();
         Ray3f ray(from.p, d, from.time, from.wavelengths);
         SurfaceInteraction3f si =
             pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, active);
@@ -493,21 +578,24 @@ private:
         Mask found = active && light != kNone;
         if (m_lights.can_be_hit() && dr::any_or<true>(found)) {
             dr::suspend_grad<Float> detached;
-            const auto &tree = m_lights.tree();
-            Row<FloatD> row = tree.row(light, plain(found));
+            const auto &tree    = m_lights.tree();
+            Row<FloatD> row     = tree.row(light, plain(found));
             Receiver<FloatD> at = receiver(si, bsdf, active);
             FloatD pdf = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
-                return light_pdf<FloatD>(row, kind, at.p, plain(hit.p), plain(Vector3f(hit.n)));
+                return light_pdf<FloatD>(row, kind, at.p, plain(hit.p),
+                                         plain(Vector3f(hit.n)));
             });
-            result = Float(pdf);
+            result     = Float(pdf);
             if (tree.kinds.has(LightKind::Other)) {
                 Mask other = found && row.is(LightKind::Other);
                 if (dr::any_or<true>(other)) {
                     DirectionSample3f ds(m_scene, hit, si);
-                    dr::masked(result, other) = emitter_of(row)->pdf_direction(si, ds, other);
+                    dr::masked(result, other) =
+                        emitter_of(row)->pdf_direction(si, ds, other);
                 }
             }
-            result *= Float(inclusion_probability(at, light, plain(u.tree), plain(found)));
+            result *=
+                Float(inclusion_probability(at, light, plain(u.tree), plain(found)));
             result = dr::select(found, result, 0.f);
         }
         Mask missed = active && !hit.is_valid();
@@ -522,18 +610,21 @@ private:
     /// Probability that `light` is a candidate at this shading point
     FloatD inclusion_probability(const Receiver<FloatD> &at, const UInt32D &light,
                                  const FloatD &u_tree, const MaskD &active) const {
-        if (m_all || m_params.visits_all())
+        if (m_all)
             return FloatD(1.f);
         if (m_params.method == Method::Talk)
-            return talk_cursor(u_tree).inclusion_probability(m_lights.tree(), at, light, active);
-        return dr::minimum(
-            1.f, dr::opaque<FloatD>(m_params.expected_candidates()) * leaf_probability(m_lights.tree(), at, light, active));
+            return talk_cursor(u_tree).inclusion_probability(m_lights.tree(), at, light,
+                                                             active);
+        return dr::minimum(1.f, dr::opaque<FloatD>(m_params.expected_candidates()) *
+                                    leaf_probability(m_lights.tree(), at, light, active));
     }
 
     const Scene *m_scene;
     const Lights &m_lights;
     const SamplingParameters &m_params;
-    bool m_all;
+    /// Is every light a candidate? Is every candidate kept? Are there more than shadow rays?
+    bool m_all, m_keep_all, m_choose;
+    /// Places for kept lights, and these together with the lights at infinity
     uint32_t m_slots, m_items;
 };
 

@@ -63,7 +63,7 @@ template <typename Float> struct SphereCone {
 template <typename Float>
 Float sphere_pdf(const SphereCone<Float> &cone, const Float &radius,
                  const mitsuba::Vector<Float, 3> &w, const mitsuba::Vector<Float, 3> &n) {
-    Float area = 4.f * dr::Pi<Float> * dr::square(radius);
+    Float area    = 4.f * dr::Pi<Float> * dr::square(radius);
     Float by_area = area_to_solid_angle(area, w, n);
     return dr::select(cone.outside && dr::dot(w, n) < 0.f, cone.pdf(),
                       dr::select(cone.outside, 0.f, by_area));
@@ -72,18 +72,18 @@ Float sphere_pdf(const SphereCone<Float> &cone, const Float &radius,
 template <typename Float>
 LightPoint<Float> sample_sphere(const Row<Float> &row, const mitsuba::Point<Float, 3> &x,
                                 const mitsuba::Point<Float, 2> &u) {
-    using Vector3f = mitsuba::Vector<Float, 3>;
-    using Frame3f  = mitsuba::Frame<Float>;
+    using Vector3f     = mitsuba::Vector<Float, 3>;
+    using Frame3f      = mitsuba::Frame<Float>;
     Vector3f to_center = row.vector(0) - x;
     Float radius       = row[3];
     SphereCone<Float> cone(to_center, radius);
 
     // Angle at the centre of the point where a direction of the cone enters
-    Float cos_theta = 1.f - u.x() * cone.one_minus_cos,
-          sin2      = u.x() * cone.one_minus_cos * (1.f + cos_theta);
+    Float cos_theta   = 1.f - u.x() * cone.one_minus_cos,
+          sin2        = u.x() * cone.one_minus_cos * (1.f + cos_theta);
     Float inv_sin_max = dr::rsqrt(cone.sin2);
-    Float cos_alpha   = sin2 * inv_sin_max +
-                      cos_theta * dr::safe_sqrt(1.f - sin2 / cone.sin2);
+    Float cos_alpha =
+        sin2 * inv_sin_max + cos_theta * dr::safe_sqrt(1.f - sin2 / cone.sin2);
     Float sin_alpha     = dr::safe_sqrt(1.f - dr::square(cos_alpha));
     auto [sin_p, cos_p] = dr::sincos(dr::TwoPi<Float> * u.y());
     Vector3f outside =
@@ -112,27 +112,28 @@ LightPoint<Float> sample_flat(const Row<Float> &row, LightKind kind,
     Float length = dr::norm(n);
 
     LightPoint<Float> result = dr::zeros<LightPoint<Float>>();
-    result.p   = row.vector(0) + b.x() * s + b.y() * t;
-    result.n   = n / length;
-    result.uv  = b;
-    result.pdf = area_to_solid_angle<Float>(
-        length * (triangle ? .5f : dr::Pi<float>), result.p - x, result.n);
+    result.p                 = row.vector(0) + b.x() * s + b.y() * t;
+    result.n                 = n / length;
+    result.uv                = b;
+    result.pdf = area_to_solid_angle<Float>(length * (triangle ? .5f : dr::Pi<float>),
+                                            result.p - x, result.n);
     return result;
 }
 
 template <typename Float>
-LightPoint<Float> sample_cylinder(const Row<Float> &row, const mitsuba::Point<Float, 3> &x,
+LightPoint<Float> sample_cylinder(const Row<Float> &row,
+                                  const mitsuba::Point<Float, 3> &x,
                                   const mitsuba::Point<Float, 2> &u) {
     using Vector3f = mitsuba::Vector<Float, 3>;
-    Vector3f axis = row.vector(3);
+    Vector3f axis  = row.vector(3);
     Float length = dr::norm(axis), radius = row[6];
     auto [sin_p, cos_p] = dr::sincos(dr::TwoPi<Float> * u.y());
     Vector3f radial =
         mitsuba::Frame<Float>(axis / length).to_world(Vector3f(cos_p, sin_p, 0.f));
 
     LightPoint<Float> result = dr::zeros<LightPoint<Float>>();
-    result.p   = row.vector(0) + u.x() * axis + radius * radial;
-    result.n   = radial * row[7];
+    result.p                 = row.vector(0) + u.x() * axis + radius * radial;
+    result.n                 = radial * row[7];
     result.pdf = area_to_solid_angle<Float>(dr::TwoPi<Float> * radius * length,
                                             result.p - x, result.n);
     return result;
@@ -180,15 +181,15 @@ template <typename Float>
 Float light_pdf(const Row<Float> &row, LightKind kind, const mitsuba::Point<Float, 3> &x,
                 const mitsuba::Point<Float, 3> &p, const mitsuba::Vector<Float, 3> &n) {
     using Vector3f = mitsuba::Vector<Float, 3>;
-    Vector3f w = p - x;
+    Vector3f w     = p - x;
     switch (kind) {
         case LightKind::Triangle:
         case LightKind::Disk: {
             Vector3f normal = dr::cross(row.vector(3), row.vector(6));
             Float length    = dr::norm(normal);
             bool triangle   = kind == LightKind::Triangle;
-            return area_to_solid_angle<Float>(
-                length * (triangle ? .5f : dr::Pi<float>), w, normal / length);
+            return area_to_solid_angle<Float>(length * (triangle ? .5f : dr::Pi<float>),
+                                              w, normal / length);
         }
         case LightKind::Sphere: {
             SphereCone<Float> cone(row.vector(0) - x, row[3]);

@@ -53,25 +53,29 @@ constexpr float kCosineRounding = 1e-6f;
  *     o = -a.w / e                                              a: mean emission axis
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
- * above it, and nothing ever becomes zero.
+ * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1.
  */
 template <typename Float>
-Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c) {
+Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,
+                               bool oriented) {
     using F4 = Four<Float>;
     F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
-    F4 e2  = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
-    F4 ie2 = dr::rcp(e2), ie = dr::sqrt(ie2);
+    F4 e2 = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
+    F4 ie = dr::rsqrt(e2), ie2 = ie * ie;
 
     F4 t = dr::fmadd(wx, F4(at.n.x()), dr::fmadd(wy, F4(at.n.y()), wz * at.n.z()));
     t    = dr::select(at.transmits, dr::abs(t), t);
     F4 cosine =
         .5f * (t + dr::sqrt(dr::fmadd(t, t, dr::fmadd(kCosineRounding, e2, c.variance))));
 
+    F4 importance = c.flux * ie2 * cosine * ie;
+    if (!oriented)
+        return importance;
     F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * ie;
     F4 k = dr::fmadd(c.axis[0], c.axis[0],
                      dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
     F4 emission = dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - k), kEmissionFloor);
-    return c.flux * ie2 * cosine * ie * emission;
+    return importance * emission;
 }
 
 /// A row of the table, gathered
@@ -123,7 +127,8 @@ Value by_kind(const Row<Float> &row, KindSet kinds, const F &f) {
 }
 
 /// Fraction of the beam that a spot sends at `cos_theta` from its axis (as Mitsuba's)
-template <typename Float> Float spot_falloff(const Row<Float> &row, const Float &cos_theta) {
+template <typename Float>
+Float spot_falloff(const Row<Float> &row, const Float &cos_theta) {
     Float angle = dr::acos(dr::clip(cos_theta, -1.f, 1.f));
     return dr::clip((row[6] - angle) * row[7], 0.f, 1.f);
 }
@@ -152,7 +157,7 @@ Float flat_intensity(const Vector3f &a, const Vector3f &w) {
 template <typename Float>
 Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
                              LightKind kind) {
-    using Vector3f = mitsuba::Vector<Float, 3>;
+    using Vector3f  = mitsuba::Vector<Float, 3>;
     Vector3f origin = row.vector(0) - at.p;
     switch (kind) {
         case LightKind::Point:
@@ -163,11 +168,12 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
             return { origin, Float(0.f), spot_falloff(row, cos_theta) };
         }
         case LightKind::Triangle: {
-            Vector3f e1 = row.vector(3), e2 = row.vector(6),
-                     a = .5f * dr::cross(e1, e2), w = origin + (e1 + e2) * (1.f / 3.f);
+            Vector3f e1 = row.vector(3), e2 = row.vector(6), a = .5f * dr::cross(e1, e2),
+                     w = origin + (e1 + e2) * (1.f / 3.f);
             // A smooth normal may lie on the other side of the plane: leave a floor
             Float floor = dr::select(row.tabulated(), 0.f, .05f * dr::norm(a));
-            return { w, .16f * dr::norm(a), dr::maximum(flat_intensity<Float>(a, w), floor) };
+            return { w, .16f * dr::norm(a),
+                     dr::maximum(flat_intensity<Float>(a, w), floor) };
         }
         case LightKind::Disk: {
             Vector3f a = dr::Pi<Float> * dr::cross(row.vector(3), row.vector(6));
@@ -200,10 +206,11 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
     Appearance<Float> a = by_kind<Appearance<Float>>(
         row, kinds, [&](LightKind kind) { return appearance(at, row, kind); });
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
-    Float t  = dr::dot(at.n, a.w);
-    t        = dr::select(at.transmits, dr::abs(t), t);
+    Float t      = dr::dot(at.n, a.w);
+    t            = dr::select(at.transmits, dr::abs(t), t);
     Float cosine = .5f * (t + dr::sqrt(t * t + a.variance)) * inv_d;
-    return row[kLuminance] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d * inv_d;
+    return row[kLuminance] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d *
+           inv_d;
 }
 
 } // namespace manylights

@@ -64,7 +64,13 @@ constexpr size_t kRowFloats = 16;
 static_assert(sizeof(LightRow) == kRowFloats * sizeof(float));
 
 /// Offsets of the fields of a row, in floats
-enum RowField : size_t { kColor = 9, kLuminance = 12, kScale = 13, kTag = 14, kLink = 15 };
+enum RowField : size_t {
+    kColor     = 9,
+    kLuminance = 12,
+    kScale     = 13,
+    kTag       = 14,
+    kLink      = 15
+};
 
 constexpr uint32_t kTagKindMask     = 7;
 constexpr uint32_t kTagTabulated    = 8;

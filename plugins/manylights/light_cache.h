@@ -96,15 +96,17 @@ private:
     static void refuse_freezing() {
         if constexpr (dr::is_jit_v<Float>)
             if (jit_flag(JitFlag::FreezingScope))
-                throw std::runtime_error(
-                    "manylights: rendering cannot be recorded by dr.freeze, because the light "
-                    "tree is built on the host. Call mi.render outside of the frozen function.");
+                throw std::runtime_error("manylights: rendering cannot be recorded by "
+                                         "dr.freeze, because the light "
+                                         "tree is built on the host. Call mi.render "
+                                         "outside of the frozen function.");
     }
 
     static std::string describe(const Statistics &s) {
         std::ostringstream oss;
-        oss << "LightTree[lights = " << s.lights << ", lights_in_tree = " << s.lights_in_tree
-            << ", nodes = " << s.nodes << ", depth = " << s.depth
+        oss << "LightTree[lights = " << s.lights
+            << ", lights_in_tree = " << s.lights_in_tree << ", nodes = " << s.nodes
+            << ", depth = " << s.depth
             << ", memory = " << mitsuba::util::mem_string((size_t) s.bytes)
             << ", built in " << mitsuba::util::time_string(s.build_ms, true) << "]";
         return oss.str();

@@ -59,7 +59,7 @@ protected:
     void put_object(std::string_view name, mitsuba::Object *value, uint32_t) override {
         if (!value)
             return;
-        std::string prefix = m_prefix;
+        std::string prefix                    = m_prefix;
         m_objects[prefix + std::string(name)] = value;
         m_prefix += std::string(name) + ".";
         value->traverse(this);
@@ -120,9 +120,10 @@ private:
     };
 
     void add(const Emitter *emitter, uint32_t index) {
-        m_emitter = index;
+        m_emitter    = index;
         bool surface = has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface);
-        bool directional = has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaDirection);
+        bool directional =
+            has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaDirection);
         std::string_view name = emitter->class_name();
         if (surface && directional)
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
@@ -132,7 +133,8 @@ private:
             add_point(emitter);
         else if (name == "SpotLight")
             add_spot(emitter);
-        else if (directional || has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
+        else if (directional ||
+                 has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
         } else
@@ -149,19 +151,22 @@ private:
     }
 
     /// Constant emission from the texture that is the parameter `name` of `emitter`
-    static Emission read_emission(const ParameterReader &params, const std::string &name) {
+    static Emission read_emission(const ParameterReader &params,
+                                  const std::string &name) {
         Emission e;
         const mitsuba::Object *texture = params.object(name);
         std::string_view type = texture ? texture->class_name() : std::string_view();
-        using Color = mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
+        using Color =
+            mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
         const Color *color = params.find<Color>(name + ".value");
         if constexpr (mitsuba::is_spectral_v<Spectrum>) {
             using Values = mitsuba::DynamicBuffer<Float>;
             bool regular = type == "RegularSpectrum";
-            const Values *d65 = params.find<Values>(name + (regular ? ".values" : ".d65.values"));
+            const Values *d65 =
+                params.find<Values>(name + (regular ? ".values" : ".d65.values"));
             bool has_color = type == "D65Spectrum" && color;
             if (d65 && (has_color || (regular && is_d65(*d65)))) {
-                e.scale = scale_of_d65(*d65);
+                e.scale    = scale_of_d65(*d65);
                 e.color[2] = std::numeric_limits<float>::infinity(); // sigmoid of 1
                 if (has_color)
                     copy3(*color, e.color);
@@ -215,9 +220,11 @@ private:
     static float spectral_mean(const Emission &e) {
         double sum = 0;
         for (size_t i = 0; i < MI_CIE_SAMPLES; ++i) {
-            double w = MI_CIE_MIN + (MI_CIE_MAX - MI_CIE_MIN) * i / (MI_CIE_SAMPLES - 1.0);
+            double w =
+                MI_CIE_MIN + (MI_CIE_MAX - MI_CIE_MIN) * i / (MI_CIE_SAMPLES - 1.0);
             double v = (e.color[0] * w + e.color[1]) * w + e.color[2],
-                   s = std::isinf(v) ? (v > 0 ? 1 : 0) : .5 + .5 * v / std::sqrt(1 + v * v);
+                   s = std::isinf(v) ? (v > 0 ? 1 : 0)
+                                     : .5 + .5 * v / std::sqrt(1 + v * v);
             sum += d65_value(i) * s;
         }
         return (float) (e.scale * sum / MI_CIE_SAMPLES);
@@ -227,35 +234,36 @@ private:
 
     void add_point(const Emitter *emitter) {
         ParameterReader params(emitter);
-        Emission e = read_emission(params, "intensity");
-        using Point3f = mitsuba::Point<Float, 3>;
+        Emission e              = read_emission(params, "intensity");
+        using Point3f           = mitsuba::Point<Float, 3>;
         const Point3f *position = params.find<Point3f>("position");
         if (!position || !e.tabulated)
             return add_other(emitter);
         LightRow row = make_row(LightKind::Point, e);
         copy3(*position, row.geometry);
         LightBounds bounds = point_bounds(row.geometry);
-        bounds.flux = 4 * dr::Pi<float> * e.luminance;
+        bounds.flux        = 4 * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
     }
 
     void add_spot(const Emitter *emitter) {
         ParameterReader params(emitter);
-        Emission e = read_emission(params, "intensity");
+        Emission e              = read_emission(params, "intensity");
         const Float *cutoff_deg = params.find<Float>("cutoff_angle"),
-                    *beam_deg = params.find<Float>("beam_width");
+                    *beam_deg   = params.find<Float>("beam_width");
         float matrix[3][4];
-        bool textured = has_flag(emitter->flags(), mitsuba::EmitterFlags::SpatiallyVarying);
+        bool textured =
+            has_flag(emitter->flags(), mitsuba::EmitterFlags::SpatiallyVarying);
         if (!e.tabulated || textured || !cutoff_deg || !beam_deg ||
             !read_similarity(emitter->world_transform(), matrix))
             return add_other(emitter);
 
         float cutoff = dr::deg_to_rad(slice(*cutoff_deg)),
-              beam = dr::deg_to_rad(slice(*beam_deg));
+              beam   = dr::deg_to_rad(slice(*beam_deg));
         LightRow row = make_row(LightKind::Spot, e);
         float length = std::hypot(matrix[0][2], matrix[1][2], matrix[2][2]);
         for (int i = 0; i < 3; ++i) {
-            row.geometry[i] = matrix[i][3];
+            row.geometry[i]     = matrix[i][3];
             row.geometry[3 + i] = matrix[i][2] / length;
         }
         row.geometry[6] = cutoff;
@@ -264,8 +272,8 @@ private:
         LightBounds bounds = point_bounds(row.geometry);
         std::copy_n(row.geometry + 3, 3, bounds.axis);
         // sqrt(flux * 4 pi * peak), see LightBounds
-        float flux = 2 * dr::Pi<float> * e.luminance *
-                     (1 - .5f * (std::cos(beam) + std::cos(cutoff)));
+        float flux  = 2 * dr::Pi<float> * e.luminance *
+                      (1 - .5f * (std::cos(beam) + std::cos(cutoff)));
         bounds.flux = std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
         add_light(row, bounds);
     }
@@ -277,15 +285,17 @@ private:
             for (size_t j = 0; j < 4; ++j)
                 matrix[i][j] = slice(transform.matrix.entry(i, j));
         float dots[6], scale = 0;
-        const int pairs[6][2] = { { 0, 0 }, { 1, 1 }, { 2, 2 }, { 0, 1 }, { 0, 2 }, { 1, 2 } };
+        const int pairs[6][2] = { { 0, 0 }, { 1, 1 }, { 2, 2 },
+                                  { 0, 1 }, { 0, 2 }, { 1, 2 } };
         for (int k = 0; k < 6; ++k) {
             dots[k] = 0;
             for (int i = 0; i < 3; ++i)
                 dots[k] += matrix[i][pairs[k][0]] * matrix[i][pairs[k][1]];
             scale = std::max(scale, std::abs(dots[k]));
         }
-        float error = std::max({ std::abs(dots[0] - dots[1]), std::abs(dots[0] - dots[2]),
-                                 std::abs(dots[3]), std::abs(dots[4]), std::abs(dots[5]) });
+        float error =
+            std::max({ std::abs(dots[0] - dots[1]), std::abs(dots[0] - dots[2]),
+                       std::abs(dots[3]), std::abs(dots[4]), std::abs(dots[5]) });
         return scale > 0 && error < 1e-5f * scale;
     }
 
@@ -293,13 +303,13 @@ private:
 
     void add_area(const Emitter *emitter, const Shape *shape) {
         ParameterReader params(emitter);
-        Emission e = read_emission(params, "radiance");
+        Emission e     = read_emission(params, "radiance");
         uint32_t first = (uint32_t) m_table.light_of_primitive.size();
         if (shape->is_mesh()) {
             add_mesh(emitter, (const Mesh *) shape, e, params.object("radiance"));
         } else {
             std::string_view name = shape->class_name();
-            uint32_t light = (uint32_t) m_table.rows.size();
+            uint32_t light        = (uint32_t) m_table.rows.size();
             if (!e.tabulated)
                 add_other(emitter);
             else if (name == "Sphere")
@@ -323,7 +333,8 @@ private:
         ParameterReader params(shape);
         const Transform *to_world = params.find<Transform>("to_world");
         if (!to_world)
-            throw std::runtime_error("manylights: the shape \"" + std::string(shape->id()) +
+            throw std::runtime_error("manylights: the shape \"" +
+                                     std::string(shape->id()) +
                                      "\" does not expose its \"to_world\"");
         for (size_t i = 0; i < 3; ++i)
             for (size_t j = 0; j < 4; ++j)
@@ -364,7 +375,7 @@ private:
         // A mirrored disk keeps its normal: swap the axes instead
         int u = determinant(m) < 0 ? 1 : 0;
         for (int i = 0; i < 3; ++i) {
-            row.geometry[i] = m[i][3];
+            row.geometry[i]     = m[i][3];
             row.geometry[3 + i] = m[i][u];
             row.geometry[6 + i] = m[i][1 - u];
         }
@@ -373,7 +384,7 @@ private:
         float radius = std::max(column_length(m, 0), column_length(m, 1));
         grow(bounds, radius);
         bounds.variance = radius * radius / 6;
-        bounds.flux = area * dr::Pi<float> * e.luminance;
+        bounds.flux     = area * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
     }
 
@@ -383,9 +394,9 @@ private:
         LightRow row = make_row(LightKind::Cylinder, e);
         float radius = column_length(m, 0), length = column_length(m, 2), center[3];
         for (int i = 0; i < 3; ++i) {
-            row.geometry[i] = m[i][3];
+            row.geometry[i]     = m[i][3];
             row.geometry[3 + i] = m[i][2];
-            center[i] = m[i][3] + .5f * m[i][2];
+            center[i]           = m[i][3] + .5f * m[i][2];
         }
         row.geometry[6] = radius;
         row.geometry[7] = shape->has_flipped_normals() ? -1.f : 1.f;
@@ -407,7 +418,7 @@ private:
                   const mitsuba::Object *texture) {
         std::vector<float> vertices = download<float>(mesh->vertex_positions_buffer());
         std::vector<uint32_t> faces = download<uint32_t>(mesh->faces_buffer());
-        size_t count = faces.size() / 3;
+        size_t count                = faces.size() / 3;
         /* With smooth normals the emitting side depends on the point: let the plugin decide
            (it compares with the shading normal). */
         std::vector<Emission> emission;
@@ -415,7 +426,7 @@ private:
             emission = face_emission(emitter, mesh, constant, texture, count);
 
         for (size_t f = 0; f < count; ++f) {
-            uint32_t light = (uint32_t) m_table.rows.size();
+            uint32_t light    = (uint32_t) m_table.rows.size();
             const Emission &e = emission.empty() ? constant : emission[f];
             add_triangle(vertices, &faces[3 * f], e, (uint32_t) f,
                          mesh->has_flipped_normals());
@@ -424,7 +435,8 @@ private:
         }
     }
 
-    template <typename T, typename Buffer> static std::vector<T> download(const Buffer &buffer) {
+    template <typename T, typename Buffer>
+    static std::vector<T> download(const Buffer &buffer) {
         auto host = dr::migrate(buffer, JitBackend::None);
         if constexpr (dr::is_jit_v<Float>)
             dr::sync_thread();
@@ -433,7 +445,7 @@ private:
 
     void add_triangle(const std::vector<float> &vertices, const uint32_t *face,
                       const Emission &e, uint32_t face_index, bool flip) {
-        LightRow row = make_row(LightKind::Triangle, e);
+        LightRow row    = make_row(LightKind::Triangle, e);
         const float *v0 = &vertices[3 * face[0]], *v1 = &vertices[3 * face[1]],
                     *v2 = &vertices[3 * face[2]];
         if (flip)
@@ -441,19 +453,19 @@ private:
         LightBounds bounds;
         double square = 0;
         for (int i = 0; i < 3; ++i) {
-            row.geometry[i] = v0[i];
+            row.geometry[i]     = v0[i];
             row.geometry[3 + i] = v1[i] - v0[i];
             row.geometry[6 + i] = v2[i] - v0[i];
-            bounds.box_min[i] = std::min({ v0[i], v1[i], v2[i] });
-            bounds.box_max[i] = std::max({ v0[i], v1[i], v2[i] });
-            double mean = ((double) v0[i] + v1[i] + v2[i]) / 3;
-            bounds.mean[i] = (float) mean;
+            bounds.box_min[i]   = std::min({ v0[i], v1[i], v2[i] });
+            bounds.box_max[i]   = std::max({ v0[i], v1[i], v2[i] });
+            double mean         = ((double) v0[i] + v1[i] + v2[i]) / 3;
+            bounds.mean[i]      = (float) mean;
             square += (v0[i] - mean) * (v0[i] - mean) + (v1[i] - mean) * (v1[i] - mean) +
                       (v2[i] - mean) * (v2[i] - mean);
         }
         bounds.variance = (float) (square / 36); // of a uniform point; trace / 3
-        float area = .5f * set_axis(bounds, row.geometry + 3, row.geometry + 6);
-        bounds.flux = area * dr::Pi<float> * e.luminance;
+        float area      = .5f * set_axis(bounds, row.geometry + 3, row.geometry + 6);
+        bounds.flux     = area * dr::Pi<float> * e.luminance;
         if (!e.tabulated) {
             std::memcpy(&row.color[0], &face_index, sizeof(float));
             row.color[1] = flip ? 1.f : 0.f;
@@ -501,7 +513,7 @@ private:
         } else {
             for (size_t i = 0; i < count; ++i) {
                 auto color = evaluate_color(emitter, mesh, faces[i], b1[i], b2[i]);
-                result[i] = { color[0], color[1], color[2] };
+                result[i]  = { color[0], color[1], color[2] };
             }
         }
         return result;
@@ -511,19 +523,19 @@ private:
 
     /// Emitted colour along the normal; three copies of the mean of a spectrum
     Color3fOf<Float> evaluate_color(const Emitter *emitter, const Mesh *mesh,
-                                    const dr::uint32_array_t<Float> &face, const Float &b1,
-                                    const Float &b2) const {
+                                    const dr::uint32_array_t<Float> &face,
+                                    const Float &b1, const Float &b2) const {
         PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        pi.t = 1.f;
-        pi.prim_uv = { b1, b2 };
-        pi.prim_index = face;
-        pi.shape = mesh;
-        Ray3f ray = dr::zeros<Ray3f>();
+        pi.t                         = 1.f;
+        pi.prim_uv                   = { b1, b2 };
+        pi.prim_index                = face;
+        pi.shape                     = mesh;
+        Ray3f ray                    = dr::zeros<Ray3f>();
         SurfaceInteraction3f si =
             mesh->compute_surface_interaction(ray, pi, +mitsuba::RayFlags::All, 0, true);
-        si.shape = mesh;
+        si.shape      = mesh;
         si.prim_index = face;
-        si.wi = { 0.f, 0.f, 1.f };
+        si.wi         = { 0.f, 0.f, 1.f };
         if constexpr (mitsuba::is_spectral_v<Spectrum>)
             si.wavelengths = { 450.f, 520.f, 590.f, 650.f };
         auto value = mitsuba::unpolarized_spectrum(emitter->eval(si, true));
@@ -545,11 +557,12 @@ private:
                                  std::vector<float>(count, c == 1 ? .9f : .05f),
                                  std::vector<float>(count, c == 2 ? .9f : .05f));
         for (size_t i = 0; i < count; ++i) {
-            Emission &e = result[i];
+            Emission &e   = result[i];
             bool constant = corner[0][i] == corner[1][i] && corner[0][i] == corner[2][i];
             for (int c = 0; c < 3; ++c)
-                e.color[c] = constant ? corner[0][i][c]
-                                      : (corner[0][i][c] + corner[1][i][c] + corner[2][i][c]) / 3;
+                e.color[c] =
+                    constant ? corner[0][i][c]
+                             : (corner[0][i][c] + corner[1][i][c] + corner[2][i][c]) / 3;
             e.luminance = luminance(e.color);
             // A spectrum cannot be recovered from its mean
             e.tabulated = constant && !mitsuba::is_spectral_v<Spectrum> &&
@@ -575,7 +588,7 @@ private:
                            const mitsuba::Object *texture,
                            std::vector<Emission> &result) const {
         std::vector<uint32_t> indices = download<uint32_t>(mesh->faces_buffer());
-        std::vector<float> uv = download<float>(mesh->vertex_texcoords_buffer());
+        std::vector<float> uv         = download<float>(mesh->vertex_texcoords_buffer());
         ScalarVector2i resolution(64, 64); // of procedural textures
         if (auto *t = dynamic_cast<const Texture *>(texture); t && has_resolution(t))
             resolution = t->resolution();
@@ -624,23 +637,23 @@ private:
 
     void add_other(const Emitter *emitter) {
         Emission e;
-        e.luminance = emitted_power(emitter) / (4 * dr::Pi<float>);
+        e.luminance  = emitted_power(emitter) / (4 * dr::Pi<float>);
         LightRow row = make_row(LightKind::Other, e);
-        auto box = emitter->bbox();
+        auto box     = emitter->bbox();
         LightBounds bounds;
         double square = 0;
         for (int i = 0; i < 3; ++i) {
             bounds.box_min[i] = (float) box.min[i];
             bounds.box_max[i] = (float) box.max[i];
-            bounds.mean[i] = .5f * ((float) box.min[i] + (float) box.max[i]);
-            bounds.axis[i] = 0;
-            double extent = (double) box.max[i] - box.min[i];
+            bounds.mean[i]    = .5f * ((float) box.min[i] + (float) box.max[i]);
+            bounds.axis[i]    = 0;
+            double extent     = (double) box.max[i] - box.min[i];
             square += extent * extent / 12;
         }
         bounds.variance = (float) (square / 3);
         std::copy_n(bounds.mean, 3, row.geometry);
         row.geometry[3] = bounds.variance;
-        bounds.flux = 4 * dr::Pi<float> * e.luminance;
+        bounds.flux     = 4 * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
     }
 
@@ -648,11 +661,11 @@ private:
     static float emitted_power(const Emitter *emitter) {
         MI_IMPORT_CORE_TYPES()
         constexpr uint32_t count = 1024;
-        float power = 0;
+        float power              = 0;
         try {
             auto weight = [&](const auto &i) {
                 using UInt = std::decay_t<decltype(i)>;
-                Float a = Float(mitsuba::radical_inverse_2(UInt(i), UInt(0)));
+                Float a    = Float(mitsuba::radical_inverse_2(UInt(i), UInt(0)));
                 Point2f u((Float(i) + .5f) / (float) count, a);
                 Point2f v(a, dr::fmadd(Float(i), .6180339887f, 0.f));
                 v.y() -= dr::floor(v.y());
@@ -682,8 +695,8 @@ private:
         LightRow row;
         std::copy_n(e.color, 3, row.color);
         row.luminance = e.luminance;
-        row.scale = e.scale;
-        row.tag = make_tag(kind, e.tabulated, m_emitter);
+        row.scale     = e.scale;
+        row.tag       = make_tag(kind, e.tabulated, m_emitter);
         return row;
     }
 
@@ -704,8 +717,8 @@ private:
 
     /// Set the emission axis to the direction of u x v; returns its length
     static float set_axis(LightBounds &bounds, const float u[3], const float v[3]) {
-        float n[3] = { u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
-                       u[0] * v[1] - u[1] * v[0] };
+        float n[3]   = { u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
+                         u[0] * v[1] - u[1] * v[0] };
         float length = std::hypot(n[0], n[1], n[2]);
         for (int i = 0; i < 3; ++i)
             bounds.axis[i] = length > 0 ? n[i] / length : 0;
@@ -717,7 +730,8 @@ private:
         ++m_table.light_count;
         bool finite = std::isfinite(bounds.flux) && std::isfinite(bounds.variance);
         for (int i = 0; i < 3; ++i)
-            finite &= std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
+            finite &=
+                std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
         if (!finite || !(bounds.flux > 0))
             return;
         bool hit_able = (row.tag & kTagKindMask) > (uint32_t) LightKind::Spot;

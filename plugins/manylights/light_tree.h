@@ -12,6 +12,7 @@
 
 #include "importance.h"
 #include "tree_builder.h"
+#include <drjit/dynamic.h>
 
 namespace manylights {
 
@@ -30,6 +31,8 @@ template <typename Float> struct TreeView {
     Storage nodes, binary, rows;
     uint32_t light_count = 0;
     KindSet kinds;
+    /// Does any light have a direction of emission?
+    bool oriented = false;
 
     /// Gather the `Count` floats of entry `index`
     template <size_t Count>
@@ -59,28 +62,30 @@ template <typename Float> struct WideNodeView {
         if constexpr (dr::is_jit_v<Float>) {
             auto lower = tree.template fetch<16>(tree.nodes, 2u * node, active),
                  upper = tree.template fetch<16>(tree.nodes, 2u * node + 1u, active);
-            unpack([&](size_t i) { return i < 16 ? lower.entry(i) : upper.entry(i - 16); });
+            unpack(tree, [&](size_t i) {
+                return i < 16 ? lower.entry(i) : upper.entry(i - 16);
+            });
         } else {
             const float *data = tree.nodes.data() + kWideNodeFloats * node;
-            unpack([data](size_t i) { return data[i]; });
+            unpack(tree, [data](size_t i) { return data[i]; });
         }
     }
 
 private:
-    template <typename Read> void unpack(const Read &read) {
+    template <typename Read> void unpack(const TreeView<Float> &tree, const Read &read) {
         auto four = [&](size_t i) {
             return Four<Float>(read(i), read(i + 1), read(i + 2), read(i + 3));
         };
-        using U4 = dr::uint32_array_t<Four<Float>>;
         using I4 = dr::int32_array_t<Four<Float>>;
         for (int i = 0; i < 3; ++i)
             clusters.mean[i] = four(4 * i);
         clusters.variance = four(12);
         clusters.flux     = four(16);
-        U4 axis           = dr::reinterpret_array<U4>(four(20));
-        for (int i = 0; i < 3; ++i) {
-            I4 quantized     = I4((axis >> (10 * i)) & 1023u);
-            clusters.axis[i] = dr::fmadd(Four<Float>(quantized), 1.f / 511.5f, -1.f);
+        if (tree.oriented) {
+            I4 axis = dr::reinterpret_array<I4>(four(20));
+            for (int i = 0; i < 3; ++i) // signed 10-bit fields
+                clusters.axis[i] =
+                    Four<Float>((axis << (22 - 10 * i)) >> 22) * (1.f / 511.f);
         }
         for (size_t i = 0; i < 4; ++i)
             child.entry(i) = dr::reinterpret_array<UInt32>(read(24 + i));
@@ -93,18 +98,19 @@ private:
  * flux. They are positive for every child and sum to 1; an empty slot has 0.
  */
 template <typename Float>
-dr::Array<Float, 4> child_probabilities(const Receiver<Float> &at,
+dr::Array<Float, 4> child_probabilities(const TreeView<Float> &tree,
+                                        const Receiver<Float> &at,
                                         const Clusters<Float> &clusters) {
-    Four<Float> h  = cluster_importance(at, clusters);
+    Four<Float> h  = cluster_importance(at, clusters, tree.oriented);
     Float sum_h    = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     Float sum_flux = (clusters.flux.entry(0) + clusters.flux.entry(1)) +
                      (clusters.flux.entry(2) + clusters.flux.entry(3));
     // On top of a light h overflows: then the flux alone decides
-    auto usable    = sum_h > 0.f && sum_h < 1e30f;
-    Float share    = dr::select(usable, Float(kDefensiveShare), 1.f);
-    Float scale_h  = dr::select(usable, (1.f - kDefensiveShare) / sum_h, 0.f);
-    Four<Float> q  = dr::fmadd(dr::select(usable, h, 0.f), Four<Float>(scale_h),
-                               clusters.flux * (share / sum_flux));
+    auto usable   = sum_h > 0.f && sum_h < 1e30f;
+    Float share   = dr::select(usable, Float(kDefensiveShare), 1.f);
+    Float scale_h = dr::select(usable, (1.f - kDefensiveShare) / sum_h, 0.f);
+    Four<Float> q = dr::fmadd(dr::select(usable, h, 0.f), Four<Float>(scale_h),
+                              clusters.flux * (share / sum_flux));
     return { q.entry(0), q.entry(1), q.entry(2), q.entry(3) };
 }
 
@@ -150,7 +156,7 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
         state, [](const State &s) { return s.link != kNone; },
         [&](State &s) {
             WideNodeView<Float> node(tree, s.link >> 2u, true);
-            auto q      = child_probabilities(at, node.clusters);
+            auto q      = child_probabilities(tree, at, node.clusters);
             UInt32 slot = s.link & 3u;
             Float p     = q.entry(0);
             for (uint32_t i = 1; i < 4; ++i)

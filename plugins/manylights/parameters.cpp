@@ -11,8 +11,8 @@ using mitsuba::Properties;
 
 [[noreturn]] void refuse(const Properties &props, const std::string &name,
                          const std::string &value, const std::string &allowed) {
-    throw std::runtime_error(std::string(props.plugin_name()) + ": the parameter \"" + name +
-                             "\" is " + value + ", but must be " + allowed + ".");
+    throw std::runtime_error(std::string(props.plugin_name()) + ": the parameter \"" +
+                             name + "\" is " + value + ", but must be " + allowed + ".");
 }
 
 uint32_t read_count(const Properties &props, const std::string &name, uint32_t fallback,
@@ -64,9 +64,11 @@ SamplingParameters read_parameters(const Properties &props) {
     p.shadow_rays    = read_count(props, "shadow_rays",
                                   std::min(p.shadow_rays, p.reservoirs), 1, p.reservoirs);
     p.bsdf_samples   = read_count(props, "bsdf_samples", p.bsdf_samples, 0, 1024);
-    p.split_function = (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
+    p.split_function =
+        (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
     if (props.has_property("split_function") && p.method != Method::Talk)
-        refuse(props, "split_function", "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
+        refuse(props, "split_function",
+               "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
                "left out unless \"method\" is \"talk\"");
     return p;
 }

@@ -19,11 +19,16 @@ struct SamplingParameters {
     Method method                = Method::ResampledTree;
     SplitFunction split_function = SplitFunction::Near;
     float splitting_rate         = 1.f;
-    uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
+    uint32_t reservoirs = 8, shadow_rays = 2, bsdf_samples = 1;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
         return std::max(1.f, kCandidatesPerRate * splitting_rate);
+    }
+    /// Upper limit of the number of candidates
+    float most_candidates() const {
+        return method == Method::Talk ? std::numeric_limits<float>::infinity()
+                                      : std::ceil(expected_candidates());
     }
     /// Is K so large that every light is visited?
     bool visits_all() const { return expected_candidates() > kMaxExpectedCandidates; }

@@ -20,8 +20,8 @@ namespace manylights {
 /// How candidates are dealt to reservoirs: greedily, or at random as in the talk
 enum class Dealing { Greedy, Random };
 
-template <typename T, typename UInt32> T read_slot(const Slots<T> &slots, const UInt32 &i,
-                                                   size_t count) {
+template <typename T, typename UInt32>
+T read_slot(const Slots<T> &slots, const UInt32 &i, size_t count) {
     if constexpr (dr::is_jit_v<T>) {
         T result = slots.entry(0);
         for (size_t k = 1; k < count; ++k)
@@ -38,7 +38,8 @@ void write_slot(Slots<T> &slots, const UInt32 &i, const T &value, size_t count,
                 const dr::mask_t<T> &active) {
     if constexpr (dr::is_jit_v<T>) {
         for (size_t k = 0; k < count; ++k)
-            slots.entry(k) = dr::select(active && i == (uint32_t) k, value, slots.entry(k));
+            slots.entry(k) =
+                dr::select(active && i == (uint32_t) k, value, slots.entry(k));
     } else {
         (void) count;
         if (active)
@@ -58,9 +59,10 @@ template <typename Float> struct Reservoirs {
     DRJIT_STRUCT(Reservoirs, weight, importance, probability, light)
 
     explicit Reservoirs(size_t count)
-        : weight(make_slots<Float>(count, 0.f)), importance(make_slots<Float>(count, 1.f)),
-          probability(make_slots<Float>(count, 1.f)), light(make_slots<UInt32>(count, 0u)) {
-    }
+        : weight(make_slots<Float>(count, 0.f)),
+          importance(make_slots<Float>(count, 1.f)),
+          probability(make_slots<Float>(count, 1.f)),
+          light(make_slots<UInt32>(count, 0u)) {}
 
     /// Deal a candidate of importance H; weights that are not positive and finite are ignored
     template <typename Rng>
@@ -68,10 +70,11 @@ template <typename Float> struct Reservoirs {
              Dealing dealing, Rng &rng) {
         Float w     = h / candidate.probability;
         Mask active = candidate.valid && w > 0.f && w < dr::Infinity<Float>;
-        UInt32 k    = dealing == Dealing::Greedy
-                          ? lightest(count)
-                          : dr::minimum(UInt32(rng.template next_float<Float>() * (float) count),
-                                        (uint32_t) count - 1u);
+        UInt32 k =
+            dealing == Dealing::Greedy
+                ? lightest(count)
+                : dr::minimum(UInt32(rng.template next_float<Float>() * (float) count),
+                              (uint32_t) count - 1u);
         Float total = read_slot<Float>(weight, k, count) + w;
         Mask take   = active && rng.template next_float<Float>() * total < w;
         write_slot<Float>(weight, k, total, count, active);

@@ -24,10 +24,10 @@ public:
             // A changed parameter is a new variable. Holding on to them keeps the indices
             // from being used again.
             dr::scoped_set_flag guard(JitFlag::EnableObjectTraversal, true);
-            object->traverse_1_cb_ro(this, [](void *self, uint64_t index, const char *,
-                                              const char *) {
-                ((Fingerprint *) self)->hold((uint32_t) index);
-            });
+            object->traverse_1_cb_ro(
+                this, [](void *self, uint64_t index, const char *, const char *) {
+                    ((Fingerprint *) self)->hold((uint32_t) index);
+                });
         } else {
             ValueHash callback(*this);
             const_cast<Object *>(object)->traverse(&callback);
@@ -38,7 +38,7 @@ public:
         return m_hash == other.m_hash && m_held.size() == other.m_held.size();
     }
 
-    Fingerprint() = default;
+    Fingerprint()               = default;
     Fingerprint(Fingerprint &&) = default;
     Fingerprint &operator=(Fingerprint &&other) {
         std::swap(m_held, other.m_held);
@@ -116,38 +116,42 @@ public:
     /// Numbers for users: `manylights tree`, `mi.traverse(integrator)`, `to_string()`
     struct Statistics {
         uint32_t lights = 0, lights_in_tree = 0, nodes = 0, depth = 0;
-        double bytes = 0;
+        double bytes   = 0;
         float build_ms = 0;
     };
 
     SceneLights(const Scene *scene, bool keep_binary) {
         mitsuba::Timer timer;
-        auto table = LightTableReader<Float, Spectrum>::read(scene);
-        LightTree tree = build_tree(table.bounds, keep_binary);
+        auto table                 = LightTableReader<Float, Spectrum>::read(scene);
+        LightTree tree             = build_tree(table.bounds, keep_binary);
         std::vector<LightRow> rows = ordered_rows(table, tree);
 
-        m_infinite = std::move(table.infinite);
+        m_infinite           = std::move(table.infinite);
         m_needs_emitter_eval = table.needs_emitter_eval;
         for (const LightRow &row : rows)
             m_tree.kinds.insert((LightKind) (row.tag & kTagKindMask));
+        for (const LightBounds &bounds : table.bounds)
+            m_tree.oriented |=
+                bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0;
         m_tree.light_count = (uint32_t) rows.size();
-        m_tree.nodes = upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
-        m_tree.binary =
-            upload((const float *) tree.binary.data(), tree.binary.size() * kBinaryNodeFloats);
-        m_tree.rows = upload((const float *) rows.data(), rows.size() * kRowFloats);
+        m_tree.nodes =
+            upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
+        m_tree.binary = upload((const float *) tree.binary.data(),
+                               tree.binary.size() * kBinaryNodeFloats);
+        m_tree.rows   = upload((const float *) rows.data(), rows.size() * kRowFloats);
         upload_map(table, tree);
         if constexpr (dr::is_jit_v<Float>)
             dr::eval(m_tree.nodes, m_tree.binary, m_tree.rows, m_shape_lights,
                      m_light_of_primitive);
 
-        m_statistics.lights = table.light_count;
+        m_statistics.lights         = table.light_count;
         m_statistics.lights_in_tree = m_tree.light_count;
-        m_statistics.nodes = (uint32_t) tree.wide.size();
-        m_statistics.depth = tree.depth;
-        m_statistics.bytes = sizeof(float) * ((double) dr::width(m_tree.nodes) +
-                                              dr::width(m_tree.binary) + dr::width(m_tree.rows) +
-                                              dr::width(m_light_of_primitive) +
-                                              dr::width(m_shape_lights));
+        m_statistics.nodes          = (uint32_t) tree.wide.size();
+        m_statistics.depth          = tree.depth;
+        m_statistics.bytes =
+            sizeof(float) * ((double) dr::width(m_tree.nodes) + dr::width(m_tree.binary) +
+                             dr::width(m_tree.rows) + dr::width(m_light_of_primitive) +
+                             dr::width(m_shape_lights));
         m_statistics.build_ms = (float) timer.value();
     }
 
@@ -175,12 +179,13 @@ public:
     bool needs_emitter_eval() const { return m_needs_emitter_eval; }
 
     /// The light that a primitive of a shape is, or kNone
-    UInt32D find(const ShapePtr &shape, const UInt32D &primitive, const MaskD &active) const {
+    UInt32D find(const ShapePtr &shape, const UInt32D &primitive,
+                 const MaskD &active) const {
         if constexpr (dr::is_jit_v<Float>) {
-            UInt32D id = plain(dr::reinterpret_array<dr::uint32_array_t<Float>>(shape));
-            using Pair = dr::Array<UInt32D, 2>;
+            UInt32D id  = plain(dr::reinterpret_array<dr::uint32_array_t<Float>>(shape));
+            using Pair  = dr::Array<UInt32D, 2>;
             MaskD known = active && id < (uint32_t) (dr::width(m_shape_lights) / 2);
-            Pair range = dr::gather<Pair>(m_shape_lights, id, known);
+            Pair range  = dr::gather<Pair>(m_shape_lights, id, known);
             known &= range.y() > 0u;
             UInt32D index = range.x() + dr::minimum(primitive, range.y() - 1u);
             UInt32D light = dr::gather<UInt32D>(m_light_of_primitive, index, known);
@@ -189,22 +194,23 @@ public:
             auto it = active ? m_shape_map.find(shape) : m_shape_map.end();
             if (it == m_shape_map.end())
                 return kNone;
-            return m_light_of_primitive.data()[it->second.first +
-                                        std::min(primitive, it->second.count - 1)];
+            return m_light_of_primitive
+                .data()[it->second.first + std::min(primitive, it->second.count - 1)];
         }
     }
 
     MI_DECLARE_CLASS(SceneLights)
 
 private:
-    using Table = HostTable<Float, Spectrum>;
+    using Table   = HostTable<Float, Spectrum>;
     using Storage = typename Tree::Storage;
-    using IndexStorage = std::conditional_t<dr::is_jit_v<Float>, UInt32D, dr::DynamicArray<UInt32D>>;
+    using IndexStorage =
+        std::conditional_t<dr::is_jit_v<Float>, UInt32D, dr::DynamicArray<UInt32D>>;
 
     static std::vector<LightRow> ordered_rows(const Table &table, const LightTree &tree) {
         std::vector<LightRow> rows(table.rows.size());
         for (size_t i = 0; i < rows.size(); ++i) {
-            rows[i] = table.rows[tree.order[i]];
+            rows[i]      = table.rows[tree.order[i]];
             rows[i].link = tree.link[i];
         }
         return rows;
@@ -231,7 +237,7 @@ private:
                 uint32_t id = jit_registry_id(s.shape);
                 if (ranges.size() < 2 * (id + 1))
                     ranges.resize(2 * (id + 1), 0);
-                ranges[2 * id] = s.first;
+                ranges[2 * id]     = s.first;
                 ranges[2 * id + 1] = s.count;
             }
             m_shape_lights = dr::load<IndexStorage>(ranges.data(), ranges.size());

@@ -95,10 +95,9 @@ public:
         std::iota(m_tree.order.begin(), m_tree.order.end(), 0u);
         m_nodes.reserve(2 * lights.size());
 
-        Moments all = sums(0, (uint32_t) lights.size());
-        m_total_flux = all.flux;
-        m_min_variance =
-            std::max(kMinVariance * all.squared_diagonal(), (double) 1e-20f);
+        Moments all    = sums(0, (uint32_t) lights.size());
+        m_total_flux   = all.flux;
+        m_min_variance = std::max(kMinVariance * all.squared_diagonal(), (double) 1e-20f);
     }
 
     LightTree build(bool keep_binary) {
@@ -140,8 +139,8 @@ private:
         }
         c.variance = (float) std::max(square / 3, m_min_variance);
         // A positive weight is a promise that the light can be chosen
-        c.flux = std::max((float) (m.flux / m_total_flux),
-                          std::numeric_limits<float>::min());
+        c.flux =
+            std::max((float) (m.flux / m_total_flux), std::numeric_limits<float>::min());
         c.cost = m.cost();
         return c;
     }
@@ -175,8 +174,8 @@ private:
         for (int i = 0; i < 3; ++i)
             longest = std::max(longest, (double) high[i] - low[i]);
 
-        double best = std::numeric_limits<double>::infinity();
-        int best_axis = -1;
+        double best       = std::numeric_limits<double>::infinity();
+        int best_axis     = -1;
         uint32_t best_bin = 0;
         for (int axis = 0; axis < 3; ++axis) {
             double extent = (double) high[axis] - low[axis];
@@ -203,7 +202,8 @@ private:
         return (uint32_t) (middle - first);
     }
 
-    void centroid_bounds(uint32_t begin, uint32_t end, float low[3], float high[3]) const {
+    void centroid_bounds(uint32_t begin, uint32_t end, float low[3],
+                         float high[3]) const {
         for (int axis = 0; axis < 3; ++axis) {
             low[axis] = high[axis] = light(begin).mean[axis];
             for (uint32_t i = begin; i < end; ++i) {
@@ -259,7 +259,7 @@ private:
             const Node &child = m_nodes[children[slot]];
             write_child(node, slot, child.cluster);
             if (child.light != kNone) {
-                node.child[slot]          = kLeafBit | child.light;
+                node.child[slot]         = kLeafBit | child.light;
                 m_tree.link[child.light] = 4 * index + slot;
             } else {
                 node.child[slot] = collapse(children[slot], 4 * index + slot, depth + 1);
@@ -334,7 +334,7 @@ uint32_t pack_axis(const float axis[3]) {
     uint32_t result = 0;
     for (int i = 0; i < 3; ++i) {
         float clamped = std::clamp(axis[i], -1.f, 1.f);
-        result |= (uint32_t) std::lround((clamped + 1.f) * 511.5f) << (10 * i);
+        result |= ((uint32_t) std::lround(clamped * 511.f) & 1023u) << (10 * i);
     }
     return result;
 }

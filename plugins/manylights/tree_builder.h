@@ -34,7 +34,7 @@ struct WideNode {
     float variance[4];
     /// Flux as a fraction of the scene's; 0 marks an empty slot
     float flux[4];
-    /// Flux-weighted mean emission axis: 10 bits for each coordinate, see \ref pack_axis
+    /// Flux-weighted mean emission axis, see \ref pack_axis
     uint32_t axis[4];
     /// Index of the child node, or kLeafBit | light
     uint32_t child[4];
@@ -82,7 +82,7 @@ struct LightTree {
  */
 LightTree build_tree(const std::vector<LightBounds> &lights, bool keep_binary);
 
-/// Quantize a vector of length <= 1 to 10 bits a coordinate
+/// Quantize a vector of length <= 1 to three signed numbers of 10 bits, in units of 1/511
 uint32_t pack_axis(const float axis[3]);
 
 } // namespace manylights

@@ -248,7 +248,6 @@ def _demo(options) -> None:
     spp = options.spp or (16 if variant.startswith("scalar") else 64)
     description = scenes.city(
         options.lights,
-        kind="mixed",
         seed=options.seed,
         width=options.width,
         height=options.height,

@@ -235,7 +235,7 @@ class block_progress:
     def __enter__(self) -> None:
         self.before = mi.logger()
         logger = mi.Logger(mi.LogLevel.Info)
-        logger.clear_appenders()
+        logger.set_formatter(self.before.formatter())
         logger.add_appender(_appender(self.jobs, self.report))
         mi.set_logger(logger)
 

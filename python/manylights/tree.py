@@ -46,7 +46,7 @@ def describe(path: str, defines: dict[str, str] | None = None) -> dict:
     integrator.render(scene, sensor=_tiny_sensor(), seed=0, spp=1)
     values = mi.traverse(integrator)
     return {
-        **{key: _number(values[key]) for key in KEYS},
+        **{key: (float if key == "build_ms" else int)(_scalar(values[key])) for key in KEYS},
         "kinds": dict(count_kinds(scene)),
     }
 
@@ -60,7 +60,7 @@ def count_kinds(scene) -> Counter:
         if shape is None:
             counts[kind] += 1
         elif shape.is_mesh():
-            counts[f"{_surface_kind(emitter)} triangle"] += shape.face_count()
+            counts[f"{_surface_kind(emitter)} triangle"] += shape.primitive_count()
         else:
             counts[f"{_surface_kind(emitter)} {shape.class_name().lower()}"] += 1
     return counts
@@ -89,7 +89,6 @@ def _tiny_sensor():
     return mi.load_dict({"type": "perspective", "film": film})
 
 
-def _number(value) -> int | float:
-    """Turn a number, or a one-element array of Dr.Jit, into a Python number."""
-    value = value if isinstance(value, (int, float)) else value[0]
-    return value if isinstance(value, int) else float(value)
+def _scalar(value):
+    """Return a number as it is, of a one-element array of Dr.Jit the element."""
+    return value if isinstance(value, (int, float)) else value[0]

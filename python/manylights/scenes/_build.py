@@ -219,8 +219,10 @@ def glowing_mesh(quads: Quads, triangles: int, *, name: str = "lights", texture:
     faces = faces[:triangles]
     black = diffuse(0.0)
     if not texture:
-        radiance = {"type": "mesh_attribute", "name": "face_color"}
-        colors = np.repeat(quads.radiance, 2, axis=0)[:triangles]
+        # Spectral variants cut attributes off at 1, so the factor is kept apart.
+        brightest = float(quads.radiance.max())
+        radiance = {"type": "mesh_attribute", "name": "face_color", "scale": brightest}
+        colors = np.repeat(quads.radiance / brightest, 2, axis=0)[:triangles]
         emitter = {"type": "area", "radiance": radiance}
         return mesh(name, vertices, faces, bsdf=black, face_color=colors, emitter=emitter)
     uv, bitmap = _texels(quads.radiance)

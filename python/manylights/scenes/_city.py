@@ -60,7 +60,7 @@ def city(
     if kind not in KINDS:
         raise ValueError(f"kind={kind!r}: choose from {', '.join(KINDS)}")
     rng = np.random.default_rng(seed)
-    wanted = (n_lights + 1) // 2 if kind == "mesh" else n_lights
+    wanted = _quads_for(n_lights, kind)
     layout = layout_for(rng, wanted)
     groups, dark = lights(rng, layout, wanted)
     parts = _surroundings(rng, layout, dark)
@@ -140,13 +140,20 @@ def _dark_glass() -> dict:
     }
 
 
-def _mixed(groups: dict[str, Quads], n_lights: int) -> dict:
-    """Lamps as spots, car lights as points, the rest as a mesh: ``n_lights`` in all.
+def _quads_for(n_lights: int, kind: str) -> int:
+    """Return how many quads of all sorts make at least ``n_lights`` lights."""
+    if kind == "mesh":
+        return (n_lights + 1) // 2
+    if kind == "mixed":
+        # At most 8/60 of the quads are lamps and cars, one light each; the others are two.
+        return -(-n_lights * 10 // 18) + 2
+    return n_lights
 
-    Windows, signs and shops have as many quads as lights are missing, and each quad is two lights:
-    half of the quads are enough.
-    """
-    lamps, cars = groups["lamps"], groups["cars"]
+
+def _mixed(groups: dict[str, Quads], n_lights: int) -> dict:
+    """Lamps as spots, car lights as points, the rest as a mesh: ``n_lights`` in all."""
+    lamps = groups["lamps"].first(n_lights)
+    cars = groups["cars"].first(n_lights - len(lamps))
     parts = {**_as_kind(lamps, "spots"), **_as_kind(cars, "points")}
     rest = Quads.join([groups[name] for name in ("signs", "shops", "windows")])
     triangles = n_lights - len(lamps) - len(cars)

@@ -175,7 +175,7 @@ def glossy(
     center = rng.uniform([-9.0, -7.0, 5.0], [9.0, 12.0, 6.5], (count, 3))
     edge = np.sqrt(30.0 / count) * rng.uniform(0.15, 0.3, count)[:, None]
     u, v = edge * np.array([0.0, 1.0, 0.0]), edge * np.array([1.0, 0.0, 0.0])
-    power = build.log_uniform(rng, count, 8.0, 2.0)[:, None]
+    power = build.log_uniform(rng, count, 60.0, 2.0)[:, None]
     colors = build.pick(rng, (build.WARM, build.WHITE, *build.NEON), count)
     lamps = Quads(center - 0.5 * (u + v), u, v, power * colors)
     metals = ("Au", "Cu", "Al", "Cr", "W")
@@ -278,7 +278,7 @@ def _ceiling_lamps(rng: np.random.Generator, count: int, side: int, per_room: in
     place = place + rng.uniform(0.6, ROOM - 0.6, (count, 2))
     center = np.concatenate([place, np.full((count, 1), CEILING - 0.02)], axis=1)
     u, v = np.array([0.0, 0.3, 0.0]), np.array([0.3, 0.0, 0.0])
-    power = build.log_uniform(rng, count, 60.0 / per_room, 1.0)[:, None]
+    power = build.log_uniform(rng, count, 200.0 / per_room, 1.0)[:, None]
     colors = build.pick(rng, (build.WARM, build.WHITE, build.COOL), count)
     shape = (count, 3)
     corner = center - 0.5 * (u + v)

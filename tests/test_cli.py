@@ -1,0 +1,271 @@
+"""The command line as users meet it: each test starts the command in a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SCENES = Path(__file__).parent.parent / "scenes"
+
+DIRECT = """<scene version="3.0.0">
+    <default name="brightness" value="1"/>
+    <integrator type="direct">
+        <boolean name="hide_emitters" value="true"/>
+        <integer name="bsdf_samples" value="2"/>
+        <integer name="emitter_samples" value="3"/>
+    </integrator>
+    <sensor type="perspective">
+        <transform name="to_world">
+            <lookat origin="0, -5, 2" target="0, 0, 0" up="0, 0, 1"/>
+        </transform>
+        <sampler type="independent"/>
+        <film type="hdrfilm">
+            <integer name="width" value="24"/>
+            <integer name="height" value="16"/>
+            <rfilter type="box"/>
+        </film>
+    </sensor>
+    <shape type="sphere"/>
+    <emitter type="point">
+        <point name="position" value="0, -2, 3"/>
+        <rgb name="intensity" value="$brightness"/>
+    </emitter>
+</scene>
+"""
+
+
+def manylights(*arguments, **options):
+    """Run the command; return the finished process with its output as text."""
+    command = [sys.executable, "-m", "manylights", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
+
+
+def assert_fails(process, *words):
+    """The command ended with status 2 and one line that has all the words."""
+    assert process.returncode == 2, process.stderr
+    lines = process.stderr.strip().splitlines()
+    assert "Traceback" not in process.stderr
+    for word in words:
+        assert word in lines[-1]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(DIRECT)
+    return path
+
+
+def render(scene, out, *arguments):
+    result = manylights(
+        "render", scene, "-o", out, "--variant", "scalar_rgb", "--spp", 4, *arguments
+    )
+    assert result.returncode == 0, result.stderr
+    return result
+
+
+def test_plugin_dir_holds_the_plugin():
+    result = manylights("plugin-dir")
+    assert result.returncode == 0
+    folder = Path(result.stdout.strip()) / "plugins"
+    assert any(path.stem == "manylights_direct" for path in folder.iterdir())
+
+
+def test_mitsuba_command_finds_the_plugin(tmp_path):
+    folder = manylights("plugin-dir").stdout.strip()
+    executable = Path(sys.executable).parent / "mitsuba"
+    if not executable.exists():
+        pytest.skip("Mitsuba's command is not beside the interpreter")
+    out = tmp_path / "out.exr"
+    arguments = ["-m", "scalar_rgb", "-a", folder, "-D", "spp=1", "-o", out]
+    command = [executable, *arguments, SCENES / "points.xml"]
+    subprocess.run(list(map(str, command)), check=True, capture_output=True, timeout=300)
+    assert out.exists()
+
+
+def test_render_writes_image_and_preview(scene, tmp_path):
+    render(scene, tmp_path / "out.exr")
+    assert (tmp_path / "out.exr").stat().st_size > 0
+    assert (tmp_path / "out.png").stat().st_size > 0
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "out.exr", "out.png"}
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_same_seed_gives_the_same_bytes(scene, tmp_path, variant):
+    import drjit as dr
+
+    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("no libLLVM")
+    images = []
+    for index, (seed, threads) in enumerate([(5, 1), (5, 2), (6, 2)]):
+        out = tmp_path / f"{index}.exr"
+        arguments = ("--seed", seed, "--threads", threads, "--variant", variant)
+        render(scene, out, *arguments)
+        images.append(out.read_bytes())
+    assert images[0] == images[1]
+    assert images[0] != images[2]
+
+
+def test_direct_is_replaced_with_its_parameters(scene, tmp_path):
+    log = render(scene, tmp_path / "out.exr").stderr
+    assert "direct replaced by manylights_direct" in log
+    assert "hide_emitters=True" in log and "bsdf_samples=2" in log
+    assert "emitter_samples=3 has no counterpart" in log
+
+
+def test_keep_leaves_direct(scene, tmp_path):
+    log = render(scene, tmp_path / "out.exr", "--integrator", "keep").stderr
+    assert "replaced" not in log
+
+
+def test_integrator_by_name(scene, tmp_path):
+    arguments = ("--integrator", "path", "--set", "max_depth=2")
+    log = render(scene, tmp_path / "out.exr", *arguments).stderr
+    assert "direct replaced by path with hide_emitters=True" in log
+
+
+def test_nested_direct_is_replaced_and_channels_are_kept(tmp_path):
+    text = (SCENES / "aov.xml").read_text().replace("manylights_direct", "direct")
+    path = tmp_path / "aov.xml"
+    path.write_text(text)
+    log = render(path, tmp_path / "out.exr", "-D", "resx=12", "-D", "resy=8").stderr
+    assert "direct replaced by manylights_direct" in log
+    import mitsuba as mi
+
+    fields = [field.name for field in mi.Bitmap(str(tmp_path / "out.exr")).struct_()]
+    assert {"R", "G", "B", "depth.T", "normal.X"} <= set(fields)
+
+
+def test_scene_parameters_are_set(scene, tmp_path):
+    import mitsuba as mi
+    import numpy as np
+
+    means = []
+    for value in (1, 2):
+        out = tmp_path / f"{value}.exr"
+        render(scene, out, "-D", f"brightness={value}")
+        means.append(np.array(mi.Bitmap(str(out)))[..., :3].mean())
+    assert means[1] == pytest.approx(2 * means[0], rel=1e-4)
+
+
+def test_tree_as_json():
+    result = manylights("tree", SCENES / "many_bulbs.xml", "--json")
+    assert result.returncode == 0, result.stderr
+    tree = json.loads(result.stdout)
+    assert set(tree) == {
+        "lights",
+        "lights_in_tree",
+        "nodes",
+        "depth",
+        "bytes",
+        "build_ms",
+        "kinds",
+    }
+    assert tree["lights"] == tree["lights_in_tree"] == 480
+    assert tree["kinds"] == {"area triangle": 480}
+
+
+def test_tree_leaves_the_environment_out():
+    tree = json.loads(manylights("tree", SCENES / "constant.xml", "--json").stdout)
+    assert (tree["lights"], tree["lights_in_tree"]) == (3, 2)
+
+
+def test_tree_as_text():
+    result = manylights("tree", SCENES / "points.xml")
+    assert result.returncode == 0, result.stderr
+    assert "12  point" in result.stdout
+
+
+def test_demo(tmp_path):
+    arguments = ("--lights", 200, "--spp", 1, "--width", 32, "--height", 18)
+    result = manylights("demo", "-o", tmp_path / "city", "--variant", "scalar_rgb", *arguments)
+    assert result.returncode == 0, result.stderr
+    assert "200 lights" in result.stdout
+    assert (tmp_path / "city.exr").exists() and (tmp_path / "city.png").exists()
+
+
+def test_missing_scene(tmp_path):
+    process = manylights("render", tmp_path / "no.xml", "-o", tmp_path / "o.exr")
+    assert_fails(process, "no.xml", "no such file")
+
+
+def test_broken_scene(tmp_path):
+    path = tmp_path / "broken.xml"
+    path.write_text('<scene version="3.0.0"><shape')
+    assert_fails(manylights("tree", path), "broken.xml")
+
+
+def test_unknown_parameter(scene, tmp_path):
+    process = manylights("render", scene, "-o", tmp_path / "o.exr", "--set", "splits=1")
+    assert_fails(process, "splits", "splitting_rate")
+
+
+def test_parameter_out_of_range(scene, tmp_path):
+    process = manylights("render", scene, "-o", tmp_path / "o.exr", "--set", "splitting_rate=-1")
+    assert_fails(process, "splitting_rate", "-1")
+
+
+def test_unknown_scene_parameter(scene, tmp_path):
+    assert_fails(manylights("render", scene, "-o", tmp_path / "o.exr", "-D", "sky=1"), "sky")
+
+
+def test_unknown_variant(scene, tmp_path):
+    process = manylights("render", scene, "-o", tmp_path / "o.exr", "--variant", "fast")
+    assert_fails(process, "fast", "scalar_rgb")
+
+
+def test_unknown_sensor(scene, tmp_path):
+    process = manylights("render", scene, "-o", tmp_path / "o.exr", "--sensor", "4")
+    assert_fails(process, "--sensor 4")
+
+
+@pytest.mark.parametrize("name", ["missing/out.exr", "out.png"])
+def test_output_that_cannot_be_written(scene, tmp_path, name):
+    assert_fails(manylights("render", scene, "-o", tmp_path / name), name)
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    process = manylights("tree", tmp_path / "no.xml", "--debug")
+    assert process.returncode != 0
+    assert "Traceback" in process.stderr
+
+
+def test_version():
+    import manylights
+
+    process = subprocess.run(
+        [sys.executable, "-m", "manylights", "--version"], capture_output=True, text=True
+    )
+    assert process.stdout.strip() == manylights.__version__
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_ctrl_c_leaves_no_file(tmp_path, variant):
+    import drjit as dr
+
+    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("no libLLVM")
+    out = tmp_path / "out.exr"
+    command = [sys.executable, "-m", "manylights", "render", SCENES / "points.xml", "-o", out]
+    command += ["--spp", "200000", "--variant", variant]
+    process = subprocess.Popen(
+        list(map(str, command)), stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        # The last line before the render starts names the integrator.
+        while not process.stderr.readline().startswith("integrator:"):
+            assert process.poll() is None
+        time.sleep(1.0)
+        start = time.monotonic()
+        os.kill(process.pid, signal.SIGINT)
+        assert process.wait(timeout=60) == 130
+        assert time.monotonic() - start < 20
+    finally:
+        process.kill()
+        process.stderr.close()
+    assert list(tmp_path.iterdir()) == []

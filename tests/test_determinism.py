@@ -1,0 +1,82 @@
+"""The same seed gives the same image, bit for bit."""
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests import light_scenes
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
+METHODS = ["resampled_tree", "talk"]
+
+# A power of two: the samples of a pixel then stay together when LLVM variants split the work, and
+# the order in which they are added does not depend on the number of threads.
+SAMPLES = 16
+
+
+def larger_scene():
+    """The mixed scene with enough pixels for both threads to get work."""
+    scene = light_scenes.SCENES["mixed"]()
+    scene["sensor"]["film"] |= {"width": 96, "height": 64}
+    return mi.load_dict(scene)
+
+
+def rendered(method, seed=7):
+    """An image from a freshly loaded scene."""
+    integrator = mi.load_dict({"type": "manylights_direct", "method": method})
+    return np.array(mi.render(larger_scene(), integrator=integrator, spp=SAMPLES, seed=seed))
+
+
+def digest(image):
+    """Checksum of the bytes of an image."""
+    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("method", METHODS)
+def test_image_does_not_depend_on_threads(variant, method, thread_count):
+    """One thread, two threads, and two again give the same bits; another seed does not."""
+    thread_count(1)
+    one = rendered(method)
+    thread_count(2)
+    two = rendered(method)
+    assert np.array_equal(one, two)
+    assert np.array_equal(two, rendered(method))
+    assert not np.array_equal(two, rendered(method, seed=8))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_repeated_rendering_of_one_scene_is_equal(variant):
+    """The tree that the first rendering builds serves the later ones unchanged."""
+    scene = larger_scene()
+    integrator = mi.load_dict({"type": "manylights_direct"})
+    images = [
+        np.array(mi.render(scene, integrator=integrator, spp=SAMPLES, seed=seed))
+        for seed in (7, 8, 7)
+    ]
+    assert np.array_equal(images[0], images[2])
+    assert not np.array_equal(images[0], images[1])
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_image_does_not_depend_on_the_process(variant):
+    """A new process renders the same bits."""
+    script = (
+        "import mitsuba, manylights\n"
+        f"mitsuba.set_variant({variant!r})\n"
+        "from tests.test_determinism import digest, rendered\n"
+        "print(digest(rendered('resampled_tree')))\n"
+    )
+    folder = Path(__file__).parents[1]
+    process = subprocess.run(
+        [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.split()[-1] == digest(rendered("resampled_tree"))

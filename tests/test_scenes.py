@@ -1,0 +1,180 @@
+"""The generated scenes and the XML scenes: complete, deterministic, loadable."""
+
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import manylights
+from manylights import rendering, scenes, tree
+from manylights.scenes import _build
+
+SCENES = Path(__file__).parent.parent / "scenes"
+FILES = sorted(SCENES.glob("*.xml"))
+VARIANTS = ["scalar_rgb", "scalar_spectral"]
+
+#: Generators whose lights are emitters; for the others, each triangle of one mesh.
+COUNTED = [name for name in scenes.names() if name != "on_emitter"]
+
+
+@pytest.fixture(params=VARIANTS)
+def variant(request):
+    mi.set_variant(request.param)
+    return request.param
+
+
+@pytest.fixture
+def scalar():
+    mi.set_variant("scalar_rgb")
+
+
+def light_count(description):
+    return sum(tree.count_kinds(mi.load_dict(description)).values())
+
+
+def fingerprint(value):
+    """Turn a scene's dictionary into nested tuples that compare by value, meshes included."""
+    if isinstance(value, dict):
+        return tuple((key, fingerprint(item)) for key, item in sorted(value.items()))
+    if isinstance(value, mi.Object):
+        parameters = mi.traverse(value)
+        keys = ("vertex_positions", "faces", "face_color")
+        return tuple(np.array(parameters[key]).tobytes() for key in keys if key in parameters)
+    return str(value)
+
+
+def test_names_are_generators():
+    assert "city" in scenes.names()
+    assert all(callable(getattr(manylights.scenes, name)) for name in scenes.names())
+
+
+@pytest.mark.parametrize("name", COUNTED)
+@pytest.mark.parametrize("count", [2, 3, 50])
+def test_number_of_lights(scalar, name, count):
+    assert light_count(getattr(scenes, name)(count)) == count
+
+
+@pytest.mark.parametrize("name", [name for name in COUNTED if name != "bright_far"])
+def test_a_single_light(scalar, name):
+    assert light_count(getattr(scenes, name)(1)) == 1
+
+
+@pytest.mark.parametrize("kind", ["mesh", "points", "spots", "quads", "mixed"])
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 501])
+def test_city_has_as_many_lights_as_asked_for(scalar, kind, count):
+    expected = 2 * count if kind == "quads" else count
+    assert light_count(scenes.city(count, kind=kind)) == expected
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_same_seed_same_scene(scalar, name):
+    generate = getattr(scenes, name)
+    assert fingerprint(generate(seed=3)) == fingerprint(generate(seed=3))
+
+
+@pytest.mark.parametrize("name", ["city", "bulbs", "rooms", "glossy", "open_plane"])
+def test_other_seed_other_scene(scalar, name):
+    generate = getattr(scenes, name)
+    assert fingerprint(generate(seed=3)) != fingerprint(generate(seed=4))
+
+
+def test_a_million_lights(scalar):
+    assert light_count(scenes.city(1_000_000)) == 1_000_000
+
+
+def test_powers_of_the_city_span_decades(scalar):
+    color = np.array(mi.traverse(scenes.city(20000)["lights"])["face_color"]).reshape(-1, 3)
+    luminance = color.max(axis=1)
+    assert luminance.min() > 0
+    assert luminance.max() / luminance.min() > 1e3
+
+
+def test_radiance_is_the_same_in_a_texture_as_in_an_attribute(scalar):
+    images = []
+    for texture in (False, True):
+        description = scenes.city(
+            3000, texture=texture, width=48, height=27, spp=8, integrator="direct"
+        )
+        # BSDF sampling alone, which Mitsuba supports for both.
+        description["integrator"].update(emitter_samples=0, bsdf_samples=1)
+        images.append(np.array(mi.render(mi.load_dict(description), seed=1)))
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_generated_scenes_render(variant, name):
+    arguments = {} if name == "on_emitter" else {"n_lights": 40}
+    description = getattr(scenes, name)(**arguments, width=24, height=16, spp=4)
+    image = np.array(mi.render(mi.load_dict(description)))
+    assert np.isfinite(image).all()
+    assert image.mean() > 0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: scenes.city(0), "n_lights=0"),
+        (lambda: scenes.bulbs(2_000_000), "n_lights=2000000"),
+        (lambda: scenes.city(10, kind="lasers"), "mesh, points"),
+        (lambda: scenes.bright_far(1), "from 2"),
+        (lambda: scenes.glossy(10, roughness=0.0), "roughness"),
+        (lambda: scenes.narrow_spots(10, cutoff=90.0), "cutoff"),
+        (lambda: scenes.rooms(10, per_room=0), "per_room"),
+    ],
+)
+def test_wrong_arguments_are_named(scalar, call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_without_variant_the_error_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(_build.mi, "variant", lambda: None)
+    with pytest.raises(RuntimeError, match="set_variant"):
+        scenes.city(10)
+
+
+def test_texels_keep_the_order_of_quads(scalar):
+    radiance = np.arange(21, dtype=float).reshape(7, 3)
+    uv, bitmap = _build._texels(radiance)
+    center = uv.reshape(-1, 4, 2).mean(axis=1)
+    pixels = np.array(bitmap)
+    texture = mi.load_dict(
+        {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+    )
+    assert pixels.shape == (3, 3, 3)
+    for index, place in enumerate(center):
+        si = mi.SurfaceInteraction3f()
+        si.uv = place.tolist()
+        np.testing.assert_allclose(texture.eval_3(si), radiance[index])
+
+
+def readme_rows():
+    """Return {file name: number of lights} of the table in the README."""
+    text = (SCENES / "README.md").read_text()
+    rows = re.findall(r"^\| `(\w+\.xml)` \|[^|]*\| (\d+) \|", text, flags=re.MULTILINE)
+    return {name: int(count) for name, count in rows}
+
+
+def test_readme_lists_every_file():
+    assert sorted(readme_rows()) == [path.name for path in FILES]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_files_are_small(path):
+    lines = path.read_text().splitlines()
+    assert len(lines) < 200
+    assert 'type="manylights_direct"' in path.read_text()
+    assert '<default name="spp"' in path.read_text()
+
+
+def test_data_files_are_small():
+    for path in (SCENES / "data").iterdir():
+        assert path.stat().st_size < 50_000, path.name
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_files_load_and_have_the_lights_of_the_readme(variant, path):
+    scene = rendering.load(str(path), {"spp": "1"}).scene
+    assert sum(tree.count_kinds(scene).values()) == readme_rows()[path.name]
