@@ -256,7 +256,7 @@ def stripes(scale):
     y, x = np.mgrid[0:8, 0:8]
     value = scale * (0.05 + 3.0 * ((x * 3 + y) % 5 == 0) * (x + 1) / 8)
     image = np.stack([value, value[::-1], 0.3 * scale + 0 * value], axis=-1).astype(np.float32)
-    return {"type": "bitmap", "data": mi.TensorXf(image), "raw": True}
+    return {"type": "bitmap", "bitmap": mi.Bitmap(image)}
 
 
 def textured():

@@ -1,4 +1,4 @@
-"""The command line as users meet it: each test starts the command in a process of its own."""
+"""The command line as users meet it, in a process of its own, and what it is made of."""
 
 import json
 import os
@@ -8,7 +8,12 @@ import sys
 import time
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
+from manylights import __version__, loading, rendering
+from manylights.progress import Estimate, format_seconds
 
 SCENES = Path(__file__).parent.parent / "scenes"
 
@@ -97,8 +102,6 @@ def test_render_writes_image_and_preview(scene, tmp_path):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_same_seed_gives_the_same_bytes(scene, tmp_path, variant):
-    import drjit as dr
-
     if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
         pytest.skip("no libLLVM")
     images = []
@@ -135,16 +138,11 @@ def test_nested_direct_is_replaced_and_channels_are_kept(tmp_path):
     path.write_text(text)
     log = render(path, tmp_path / "out.exr", "-D", "resx=12", "-D", "resy=8").stderr
     assert "direct replaced by manylights_direct" in log
-    import mitsuba as mi
-
     fields = [field.name for field in mi.Bitmap(str(tmp_path / "out.exr")).struct_()]
     assert {"R", "G", "B", "depth.T", "normal.X"} <= set(fields)
 
 
 def test_scene_parameters_are_set(scene, tmp_path):
-    import mitsuba as mi
-    import numpy as np
-
     means = []
     for value in (1, 2):
         out = tmp_path / f"{value}.exr"
@@ -236,18 +234,67 @@ def test_debug_shows_the_traceback(tmp_path):
 
 
 def test_version():
-    import manylights
+    assert manylights("--version").stdout.strip() == __version__
 
-    process = subprocess.run(
-        [sys.executable, "-m", "manylights", "--version"], capture_output=True, text=True
-    )
-    assert process.stdout.strip() == manylights.__version__
+
+@pytest.mark.parametrize("spp", [1, 3, 16, 100, 1000])
+@pytest.mark.parametrize("pixels", [1, 640 * 360, 3840 * 2160])
+def test_passes_add_up_and_are_bounded(spp, pixels):
+    sizes = rendering.pass_sizes(spp, pixels)
+    assert sum(sizes) == spp
+    assert min(sizes) >= 1
+    assert max(sizes) * pixels <= max(rendering.MAX_SAMPLES_PER_PASS, pixels)
+    assert len(set(sizes[:-1])) <= 1
+
+
+def test_seeds_of_passes_differ_and_the_first_is_the_seed():
+    seeds = [rendering.pass_seed(seed, index) for seed in range(20) for index in range(20)]
+    assert len(set(seeds)) == 400
+    assert rendering.pass_seed(7, 0) == 7
+
+
+def test_passes_give_the_mean_of_their_samples(monkeypatch):
+    """Five passes are the mean of five renders, weighted by samples, in all channels."""
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        pytest.skip("no libLLVM")
+    mi.set_variant("llvm_ad_rgb")
+    monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", 0)
+    loaded = loading.load(str(SCENES / "aov.xml"), {"resx": "24", "resy": "16"})
+    fractions = []
+    together = np.array(rendering.render(loaded, 0, 18, 3, fractions.append))
+    sizes = rendering.pass_sizes(18, 24 * 16)
+    assert fractions == pytest.approx(np.cumsum(sizes) / 18)
+    expected = 0.0
+    for index, size in enumerate(sizes):
+        seed = rendering.pass_seed(3, index)
+        mi.render(loaded.scene, seed=seed, spp=size)
+        image = loaded.scene.sensors()[0].film().bitmap()
+        expected = expected + np.array(image) * size / 18
+    np.testing.assert_allclose(together, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_estimate_advances_between_reports_but_not_past_the_next_one():
+    now = [0.0]
+    estimate = Estimate(clock=lambda: now[0])
+    assert estimate.fraction() == 0.0 and estimate.seconds_left() is None
+    now[0] = 10.0
+    estimate.report(0.25)
+    assert estimate.seconds_left() == pytest.approx(30.0)
+    now[0] = 15.0
+    assert estimate.fraction() == pytest.approx(0.375)
+    now[0] = 100.0
+    assert estimate.fraction() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(None, "-:--"), (0.4, "0:00"), (65, "1:05"), (3723, "1:02:03")]
+)
+def test_times_are_readable(seconds, text):
+    assert format_seconds(seconds) == text
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_ctrl_c_leaves_no_file(tmp_path, variant):
-    import drjit as dr
-
     if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
         pytest.skip("no libLLVM")
     out = tmp_path / "out.exr"

@@ -3,6 +3,8 @@
 `tests/README.md` says how the references are made. A failure writes a picture of the difference.
 """
 
+import gc
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -28,6 +30,13 @@ SAMPLES = 16
 # The camera looks at hundreds of small, bright bulbs: their borders are most of the noise.
 SAMPLES_OF = {"many_bulbs": 64}
 BIAS_OF = {"many_bulbs": 0.05, "no_lights": None}
+
+
+@pytest.fixture(autouse=True)
+def no_scene_is_left():
+    """Free the scenes of a test: calls of emitters in LLVM variants compile those of all scenes."""
+    yield
+    gc.collect()
 
 
 def images_of(name, scene, sensor):

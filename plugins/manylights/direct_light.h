@@ -118,19 +118,20 @@ public:
         UInt32D light(kNone);
         Mask valid = active && si.is_valid();
         if (m_lights.can_be_hit()) {
-            light      = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
-            Mask found = light != kNone;
-            if (dr::any_or<true>(found)) {
-                Row<FloatD> row = m_lights.tree().row(light, plain(found));
-                Mask tabulated  = found && Mask(row.tabulated());
+            light         = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
+            Mask in_table = light < kOnlyHit, by_plugin = light == kOnlyHit;
+            if (dr::any_or<true>(in_table)) {
+                Row<FloatD> row = m_lights.tree().row(light, plain(in_table));
+                Mask tabulated  = in_table && row.tabulated();
                 Mask front      = Frame3f::cos_theta(si.wi) > 0.f;
+                by_plugin |= in_table && !tabulated;
                 if (dr::any_or<true>(tabulated))
                     result = mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) &
                                                             (tabulated && front));
-                if (m_lights.needs_emitter_eval())
-                    add_masked(result, found && !tabulated,
-                               [&](Mask m) { return emitter_of(row)->eval(si, m); });
             }
+            if (m_lights.needs_emitter_eval())
+                add_masked(result, by_plugin,
+                           [&](Mask m) { return si.shape->emitter()->eval(si, m); });
         }
         if (const Emitter *environment = m_scene->environment())
             add_masked(result, active && !si.is_valid(),
@@ -575,7 +576,7 @@ private:
                       const SurfaceInteraction3f &hit, const UInt32D &light,
                       const LightSample<Float> &u, Mask active) const {
         Float result(0.f);
-        Mask found = active && light != kNone;
+        Mask found = active && light < kOnlyHit;
         if (m_lights.can_be_hit() && dr::any_or<true>(found)) {
             dr::suspend_grad<Float> detached;
             const auto &tree    = m_lights.tree();

@@ -26,6 +26,8 @@ constexpr uint32_t kLightKinds = 7;
 
 /// Marks "no light", "no node" and "not a primitive of a light"
 constexpr uint32_t kNone = 0xffffffffu;
+/// A primitive that emits but cannot be sampled: rays that hit it see its emission
+constexpr uint32_t kOnlyHit = 0xfffffffeu;
 
 /**
  * One row of the table.

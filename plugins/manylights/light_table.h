@@ -88,7 +88,7 @@ template <typename Float, typename Spectrum> struct HostTable {
     /// Emitters without a place: environments, suns, directional lights
     std::vector<const Emitter *> infinite;
     std::vector<ShapeLights<Shape>> shapes;
-    /// Index into `rows`, kNone for a primitive that does not emit
+    /// Index into `rows`, kOnlyHit, or kNone for a primitive that does not emit
     std::vector<uint32_t> light_of_primitive;
     /// Lights of any kind, those left out of the tree included
     uint32_t light_count = 0;
@@ -320,8 +320,7 @@ private:
                 add_cylinder(shape, e);
             else
                 add_other(emitter);
-            bool added = m_table.rows.size() > light;
-            m_table.light_of_primitive.push_back(added ? light : kNone);
+            push_primitive(light);
         }
         uint32_t count = (uint32_t) m_table.light_of_primitive.size() - first;
         m_table.shapes.push_back({ shape, first, count });
@@ -430,8 +429,7 @@ private:
             const Emission &e = emission.empty() ? constant : emission[f];
             add_triangle(vertices, &faces[3 * f], e, (uint32_t) f,
                          mesh->has_flipped_normals());
-            bool added = m_table.rows.size() > light;
-            m_table.light_of_primitive.push_back(added ? light : kNone);
+            push_primitive(light);
         }
     }
 
@@ -635,19 +633,27 @@ private:
 
     // --------------------------------------------------------------- Anything else
 
+    /// One light for the whole emitter, sampled by its plugin
     void add_other(const Emitter *emitter) {
+        ScalarPoint3f low, high;
+        if (!can_sample(emitter))
+            return add_only_hit();
+        if (!find_bounds(emitter, low, high)) {
+            // Without a place it cannot be in the tree: always a candidate
+            ++m_table.light_count;
+            m_table.infinite.push_back(emitter);
+            return;
+        }
         Emission e;
-        e.luminance  = emitted_power(emitter) / (4 * dr::Pi<float>);
-        LightRow row = make_row(LightKind::Other, e);
-        auto box     = emitter->bbox();
-        LightBounds bounds;
-        double square = 0;
+        e.luminance        = emitted_power(emitter) / (4 * dr::Pi<float>);
+        LightRow row       = make_row(LightKind::Other, e);
+        LightBounds bounds = {};
+        double square      = 0;
         for (int i = 0; i < 3; ++i) {
-            bounds.box_min[i] = (float) box.min[i];
-            bounds.box_max[i] = (float) box.max[i];
-            bounds.mean[i]    = .5f * ((float) box.min[i] + (float) box.max[i]);
-            bounds.axis[i]    = 0;
-            double extent     = (double) box.max[i] - box.min[i];
+            bounds.box_min[i] = (float) low[i];
+            bounds.box_max[i] = (float) high[i];
+            bounds.mean[i]    = .5f * ((float) low[i] + (float) high[i]);
+            double extent     = (double) high[i] - low[i];
             square += extent * extent / 12;
         }
         bounds.variance = (float) (square / 3);
@@ -655,6 +661,39 @@ private:
         row.geometry[3] = bounds.variance;
         bounds.flux     = 4 * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
+    }
+
+    /// Count a light that only rays can find
+    void add_only_hit() {
+        ++m_table.light_count;
+        m_table.needs_emitter_eval = true;
+        m_only_hit                 = true;
+    }
+
+    /// Some shapes of Mitsuba (curves) have no way to choose a point on them
+    static bool can_sample(const Emitter *emitter) {
+        try {
+            SurfaceInteraction3f si = dr::zeros<SurfaceInteraction3f>();
+            auto [ds, weight]       = emitter->sample_direction(si, Point2f(.5f), true);
+            (void) ds;
+            (void) weight;
+            return true;
+        } catch (const std::exception &) {
+            return false;
+        }
+    }
+
+    static bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
+                            ScalarPoint3f &high) {
+        auto box = emitter->bbox();
+        low      = box.min;
+        high     = box.max;
+        if (has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaPosition)) {
+            auto position = emitter->world_transform().translation();
+            for (int i = 0; i < 3; ++i)
+                low[i] = high[i] = slice(position.entry(i));
+        }
+        return dr::all(dr::isfinite(low) && dr::isfinite(high) && low <= high);
     }
 
     /// Mean weight of rays that the emitter sends out; 1 if it cannot send any
@@ -690,6 +729,14 @@ private:
     }
 
     // ----------------------------------------------------------------- Common parts
+
+    /// The primitive is the light that was added since, if any
+    void push_primitive(uint32_t next_light) {
+        bool added = m_table.rows.size() > next_light;
+        m_table.light_of_primitive.push_back(added ? next_light
+                                                   : (m_only_hit ? kOnlyHit : kNone));
+        m_only_hit = false;
+    }
 
     LightRow make_row(LightKind kind, const Emission &e) const {
         LightRow row;
@@ -732,16 +779,21 @@ private:
         for (int i = 0; i < 3; ++i)
             finite &=
                 std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
-        if (!finite || !(bounds.flux > 0))
+        bool hit_able  = (row.tag & kTagKindMask) > (uint32_t) LightKind::Spot;
+        bool by_plugin = hit_able && !(row.tag & kTagTabulated);
+        m_table.needs_emitter_eval |= by_plugin;
+        if (!finite || !(bounds.flux > 0)) {
+            m_only_hit = by_plugin; // black as far as the quadrature saw
             return;
-        bool hit_able = (row.tag & kTagKindMask) > (uint32_t) LightKind::Spot;
-        m_table.needs_emitter_eval |= hit_able && !(row.tag & kTagTabulated);
+        }
         m_table.rows.push_back(row);
         m_table.bounds.push_back(bounds);
     }
 
     Table m_table;
+    /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
+    bool m_only_hit    = false;
 };
 
 } // namespace manylights

@@ -19,7 +19,7 @@ struct SamplingParameters {
     Method method                = Method::ResampledTree;
     SplitFunction split_function = SplitFunction::Near;
     float splitting_rate         = 1.f;
-    uint32_t reservoirs = 8, shadow_rays = 2, bsdf_samples = 1;
+    uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {

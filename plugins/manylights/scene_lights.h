@@ -8,7 +8,7 @@
 #include "emission.h"
 #include "light_table.h"
 #include <drjit/tensor.h>
-#include <mitsuba/core/timer.h>
+#include <chrono>
 #include <unordered_map>
 
 namespace manylights {
@@ -121,7 +121,7 @@ public:
     };
 
     SceneLights(const Scene *scene, bool keep_binary) {
-        mitsuba::Timer timer;
+        auto start = std::chrono::steady_clock::now();
         auto table                 = LightTableReader<Float, Spectrum>::read(scene);
         LightTree tree             = build_tree(table.bounds, keep_binary);
         std::vector<LightRow> rows = ordered_rows(table, tree);
@@ -152,7 +152,8 @@ public:
             sizeof(float) * ((double) dr::width(m_tree.nodes) + dr::width(m_tree.binary) +
                              dr::width(m_tree.rows) + dr::width(m_light_of_primitive) +
                              dr::width(m_shape_lights));
-        m_statistics.build_ms = (float) timer.value();
+        m_statistics.build_ms = std::chrono::duration<float, std::milli>(
+                                    std::chrono::steady_clock::now() - start).count();
     }
 
     static Fingerprint<Float> fingerprint(const Scene *scene) {
@@ -173,12 +174,12 @@ public:
         KindSet delta;
         delta.insert(LightKind::Point);
         delta.insert(LightKind::Spot);
-        return (m_tree.kinds.bits & ~delta.bits) != 0;
+        return (m_tree.kinds.bits & ~delta.bits) != 0 || m_needs_emitter_eval;
     }
     /// Is there an emissive surface whose radiance is not in the table?
     bool needs_emitter_eval() const { return m_needs_emitter_eval; }
 
-    /// The light that a primitive of a shape is, or kNone
+    /// The light that a primitive of a shape is, kOnlyHit, or kNone
     UInt32D find(const ShapePtr &shape, const UInt32D &primitive,
                  const MaskD &active) const {
         if constexpr (dr::is_jit_v<Float>) {
@@ -227,7 +228,7 @@ private:
             position[tree.order[i]] = (uint32_t) i;
         std::vector<uint32_t> lights(table.light_of_primitive);
         for (uint32_t &light : lights)
-            light = light == kNone ? kNone : position[light];
+            light = light >= kOnlyHit ? light : position[light];
         lights.push_back(kNone);
         m_light_of_primitive = dr::load<IndexStorage>(lights.data(), lights.size());
 

@@ -16,13 +16,15 @@ FAILURE = 2
 RENDER_HELP = """\
 Renders an XML scene to an OpenEXR file and writes a PNG preview beside it.
 
-The same scene, variant, number of samples and seed give the same image. Scalar variants render all
-samples in one go. JIT variants do so up to 4 million samples for the whole image; longer renders
-are split into passes of a power of two of samples per pixel, at least four passes and at most 16
-million samples each. The first pass uses the seed, the others seeds derived from it, and each
-sample counts the same. Stratified samplers stratify within a pass. With a reconstruction filter
-wider than a pixel (anything but "box") threads add to the same pixel in varying order: the last
-bits of the image are then the same from run to run only with --threads 1.
+The same scene, variant, number of samples and seed give the same image. Scalar
+variants render all samples in one go. JIT variants do so up to 4 million
+samples for the whole image; longer renders are split into passes of a power of
+two of samples per pixel, at least four passes and at most 16 million samples
+each. The first pass uses the seed, the others seeds derived from it, and each
+sample counts the same. Stratified samplers stratify within a pass. With a
+reconstruction filter wider than a pixel (anything but "box"), threads add to
+the same pixel in varying order: the last bits of the image are then the same
+from run to run only with --threads 1.
 """
 
 DEMO_HELP = """\
@@ -58,7 +60,9 @@ def _parser() -> argparse.ArgumentParser:
 
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    parser = argparse.ArgumentParser(prog="manylights", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="manylights", description="Renders scenes with very many lights."
+    )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
@@ -153,7 +157,9 @@ def _add_machine(parser) -> None:
     parser.add_argument(
         "--variant", help="Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scalar_rgb)"
     )
-    parser.add_argument("--threads", type=_positive, help="CPU threads (default: all)")
+    parser.add_argument(
+        "--threads", type=_positive, help="CPU threads of the render (default: all)"
+    )
 
 
 def _positive(text: str) -> int:
@@ -175,14 +181,10 @@ def _say(text: str) -> None:
 
 
 def _start(options) -> str:
-    """Set threads and variant as asked for, say which variant and why, and return it."""
-    import drjit as dr
+    """Set the variant asked for, say which it is and why, and return it."""
+    from manylights import loading
 
-    from manylights import rendering
-
-    if options.threads:
-        dr.set_thread_count(options.threads)
-    variant = rendering.set_variant(options.variant)
+    variant = loading.set_variant(options.variant)
     if options.variant:
         reason = "as asked for"
     else:
@@ -198,30 +200,31 @@ def _plugin_dir(options) -> None:
 
 
 def _render(options) -> None:
-    from manylights import integrators, rendering
+    from manylights import images, integrators, loading
 
-    target = rendering.check_output(options.output)
+    target = images.check_output(options.output)
     defines = integrators.parse_assignments(options.define, "-D")
     settings = integrators.parse_assignments(options.set, "--set")
     settings = {name: integrators.parse_value(text) for name, text in settings.items()}
     _start(options)
-    loaded = rendering.load(options.scene, defines, options.integrator, settings)
+    loaded = loading.load(options.scene, defines, options.integrator, settings)
     for note in loaded.notes:
         _say(note)
-    _render_to(loaded, target, options.sensor, options.spp, options.seed)
+    _render_to(loaded, target, options, options.spp, options.sensor)
 
 
-def _render_to(loaded, target, sensor: int, spp: int, seed: int) -> float:
+def _render_to(loaded, target, options, spp: int, sensor: int = 0) -> float:
     """Render with a progress bar, write the images, and return the seconds of the render."""
-    from manylights import rendering
+    from manylights import images, rendering
     from manylights.progress import run_with_bar
 
+    def work(report):
+        return rendering.render(loaded, sensor, spp, options.seed, report, options.threads)
+
     start = time.perf_counter()
-    bitmap = run_with_bar(
-        "rendering", lambda report: rendering.render(loaded, sensor, spp, seed, report)
-    )
+    bitmap = run_with_bar("rendering", work)
     seconds = time.perf_counter() - start
-    written, notes = rendering.write_images(bitmap, target)
+    written, notes = images.write_images(bitmap, target)
     for note in notes:
         _say(note)
     names = " and ".join(str(path) for path in written)
@@ -230,9 +233,9 @@ def _render_to(loaded, target, sensor: int, spp: int, seed: int) -> float:
 
 
 def _tree(options) -> None:
-    from manylights import integrators, rendering, tree
+    from manylights import integrators, loading, tree
 
-    rendering.set_variant(options.variant)
+    loading.set_variant(options.variant)
     defines = integrators.parse_assignments(options.define, "-D")
     description = tree.describe(options.scene, defines)
     print(json.dumps(description) if options.json else tree.format_report(description))
@@ -241,9 +244,9 @@ def _tree(options) -> None:
 def _demo(options) -> None:
     import mitsuba as mi
 
-    from manylights import rendering, scenes, tree
+    from manylights import images, integrators, loading, scenes, tree
 
-    target = rendering.check_output(f"{options.output}.exr")
+    target = images.check_output(f"{options.output}.exr")
     variant = _start(options)
     spp = options.spp or (16 if variant.startswith("scalar") else 64)
     description = scenes.city(
@@ -252,11 +255,12 @@ def _demo(options) -> None:
         width=options.width,
         height=options.height,
         spp=spp,
+        integrator={"type": integrators.OURS, "block_size": integrators.BLOCK_SIZE},
     )
-    loaded = rendering.LoadedScene(mi.load_dict(description), 1, [])
+    loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
     lights = sum(tree.count_kinds(loaded.scene).values())
     _say(f"lights: {lights:,}")
-    seconds = _render_to(loaded, target, 0, spp, options.seed)
+    seconds = _render_to(loaded, target, options, spp)
     print(f"{lights:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")
 
 

@@ -28,6 +28,10 @@ PARAMETERS = {
 #: Parameters of Mitsuba's own base classes, accepted too.
 BASE_PARAMETERS = ("block_size", "timeout")
 
+#: Integrators that render an image in blocks, and Mitsuba's own size of them, in pixels.
+USING_BLOCKS = (OURS, "aov", "depth", "direct", "moment", "path", "stokes", "volpath", "volpathmis")
+BLOCK_SIZE = 32
+
 
 def parse_value(text: str) -> bool | int | float | str:
     """Interpret the right-hand side of ``--set name=value``.
@@ -90,6 +94,17 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
     for node in leaves:
         _apply(node.props, settings)
     return notes
+
+
+def fix_block_size(state) -> None:
+    """Make the images of scalar variants independent of the number of threads, in place.
+
+    They render blocks of pixels, each with random numbers of its own. Mitsuba makes the blocks
+    smaller where an image has fewer than there are threads; a size that is set stays.
+    """
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Integrator and node.props.plugin_name() in USING_BLOCKS:
+            node.props["block_size"] = node.props.get("block_size", BLOCK_SIZE)
 
 
 def leaf_integrators(state) -> list:

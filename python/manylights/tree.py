@@ -6,7 +6,8 @@ from collections import Counter
 
 import mitsuba as mi
 
-from manylights import integrators, rendering
+from manylights import integrators, loading
+from manylights.threads import threads_for_files
 
 #: What the integrator publishes once the tree is built, in the order of the report.
 KEYS = ("lights", "lights_in_tree", "nodes", "depth", "bytes", "build_ms")
@@ -38,10 +39,10 @@ def describe(path: str, defines: dict[str, str] | None = None) -> dict:
         The numbers named in ``KEYS`` (``bytes`` of memory, ``build_ms`` milliseconds) and
         ``kinds``, a dictionary from the kind of light to its count.
     """
-    with rendering.search_beside(path):
-        config, state = rendering.parse(path, defines or {})
+    with loading.search_beside(path), threads_for_files():
+        config, state = loading.parse(path, defines or {})
         parameters = integrators.parameters_of_ours(state)
-        scene = rendering.instantiate(config, state)
+        scene = loading.instantiate(config, state)
     integrator = mi.load_dict({"type": integrators.OURS, **parameters})
     integrator.render(scene, sensor=_tiny_sensor(), seed=0, spp=1)
     values = mi.traverse(integrator)

@@ -1,0 +1,67 @@
+"""Writes images so that a file is there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mitsuba as mi
+
+from manylights.errors import UsageError
+from manylights.threads import threads_for_files
+
+
+def check_output(path: str) -> Path:
+    """Return ``path`` if an EXR file can be written there.
+
+    Raises:
+        UsageError: another ending, no such folder, a folder of that name, or no permission.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".exr":
+        raise UsageError(f"-o {path}: the image is an OpenEXR file, end the name in .exr")
+    if not target.parent.is_dir():
+        raise UsageError(f"-o {path}: there is no folder {target.parent}")
+    if target.is_dir() or not os.access(target.parent, os.W_OK):
+        raise UsageError(f"-o {path}: not writable")
+    return target
+
+
+def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
+    """Write ``bitmap`` as EXR to ``target`` and as PNG (8 bits, sRGB) beside it.
+
+    Each file is written under another name first and then renamed, so it is there whole or not
+    at all.
+
+    Returns:
+        The written files, and lines for the log about what could not be written.
+    """
+    written, notes = [_write(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)], []
+    preview = _preview(bitmap)
+    if preview is None:
+        notes.append("preview: the film has no colour channels, no PNG written")
+    else:
+        file_format = mi.Bitmap.FileFormat.PNG
+        written.append(_write(preview, target.with_suffix(".png"), file_format))
+    return written, notes
+
+
+def _preview(bitmap):
+    """Return an 8-bit sRGB version of the colour channels, None if there are none."""
+    formats = mi.Bitmap.PixelFormat
+    if bitmap.pixel_format() == formats.MultiChannel:
+        bitmap = dict(bitmap.split()).get("<root>", bitmap)
+    if bitmap.pixel_format() == formats.MultiChannel:
+        return None
+    return bitmap.convert(formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+
+
+def _write(bitmap, target: Path, file_format) -> Path:
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        with threads_for_files():
+            bitmap.write(str(partial), file_format)
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+    return target

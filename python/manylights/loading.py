@@ -1,0 +1,121 @@
+"""Sets the variant and loads XML scenes, with the integrator that was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+
+from manylights import integrators
+from manylights.errors import UsageError
+from manylights.threads import threads_for_files
+
+
+@dataclass
+class LoadedScene:
+    """A scene, how many integrators it nests, and what was said about choosing them."""
+
+    scene: object
+    integrator_count: int
+    notes: list[str]
+
+
+def default_variant() -> str:
+    """Return ``llvm_ad_rgb`` where libLLVM is installed, else ``scalar_rgb``."""
+    has_llvm = "llvm_ad_rgb" in mi.variants() and dr.has_backend(dr.JitBackend.LLVM)
+    return "llvm_ad_rgb" if has_llvm else "scalar_rgb"
+
+
+def set_variant(name: str | None) -> str:
+    """Set Mitsuba's variant, ``None`` for the default one, and return its name.
+
+    Raises:
+        UsageError: Mitsuba does not have it, or the machine lacks LLVM or CUDA.
+    """
+    variant = name or default_variant()
+    if variant not in mi.variants():
+        raise UsageError(f"--variant {variant}: unknown, choose from {', '.join(mi.variants())}")
+    for prefix, backend in (("llvm", dr.JitBackend.LLVM), ("cuda", dr.JitBackend.CUDA)):
+        if variant.startswith(prefix) and not dr.has_backend(backend):
+            raise UsageError(
+                f"--variant {variant}: this machine has no usable {prefix.upper()} library, "
+                "use a scalar variant or install it"
+            )
+    mi.set_variant(variant)
+    return variant
+
+
+def parse(path: str, defines: dict[str, str]):
+    """Parse an XML scene into ``(config, state)`` of ``mi.parser``, upgraded, not transformed.
+
+    Args:
+        path: the XML file.
+        defines: values for the scene's ``<default>`` parameters, by name.
+
+    Raises:
+        UsageError: there is no such file.
+        RuntimeError: Mitsuba cannot read it.
+    """
+    if not Path(path).is_file():
+        raise UsageError(f"{path}: no such file")
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_file(config, str(path), **defines)
+    mi.parser.transform_upgrade(config, state)
+    return config, state
+
+
+def instantiate(config, state):
+    """Make Mitsuba's objects of a parsed scene.
+
+    Raises:
+        UsageError: the file describes something that is not a scene.
+    """
+    mi.parser.transform_resolve(config, state)
+    if config.merge_equivalent:
+        mi.parser.transform_merge_equivalent(config, state)
+    if config.merge_meshes:
+        mi.parser.transform_merge_meshes(config, state)
+    scene = mi.parser.instantiate(config, state)
+    if not isinstance(scene, mi.Scene):
+        raise UsageError("the file holds no <scene>")
+    return scene
+
+
+class search_beside:
+    """Context in which Mitsuba looks for a scene's files in the folder of ``path`` first."""
+
+    def __init__(self, path: str) -> None:
+        self.folder = str(Path(path).resolve().parent)
+
+    def __enter__(self) -> None:
+        self.before = mi.file_resolver()
+        resolver = type(self.before)(self.before)
+        resolver.prepend(self.folder)
+        mi.set_file_resolver(resolver)
+
+    def __exit__(self, *_) -> None:
+        mi.set_file_resolver(self.before)
+
+
+def load(
+    path: str,
+    defines: dict[str, str] | None = None,
+    integrator: str | None = None,
+    settings: dict | None = None,
+) -> LoadedScene:
+    """Load an XML scene and choose its integrator (see ``integrators.choose``).
+
+    Args:
+        path: the XML file.
+        defines: values for the scene's ``<default>`` parameters. Default: none.
+        integrator: ``None`` (``direct`` becomes ours), ``"keep"`` or a plugin's name.
+        settings: parameters to set on the integrator. Default: none.
+    """
+    with search_beside(path), threads_for_files():
+        config, state = parse(path, defines or {})
+        notes = integrators.choose(state, integrator, settings or {})
+        integrators.fix_block_size(state)
+        count = sum(node.type == mi.ObjectType.Integrator for node in state.nodes)
+        return LoadedScene(instantiate(config, state), max(count, 1), notes)
