@@ -5,6 +5,7 @@ that samples are compared with come from `Tree.probabilities`, which walks from 
 sampling walks the other way.
 """
 
+import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 
@@ -401,7 +402,7 @@ def test_sum_is_unbiased_at_a_light():
     values[:, 7] = 0
     values = np.minimum(values, 5 * probabilities(tree, at))
     tools.assert_same_mean(
-        horvitz_thompson(draw(tree, at, 24.0, TRIALS), values), exact_sums(values)
+        horvitz_thompson(draw(tree, at, 24.0, 2 * TRIALS), values), exact_sums(values)
     )
 
 
@@ -473,15 +474,14 @@ def test_talk_without_splitting_gives_one_candidate(at, xi, function):
 
 
 @every_function
-@every_receiver
-@pytest.mark.parametrize("xi", [0.0, 0.5, 1 - 2.0**-24])
 @pytest.mark.parametrize("rate", [HUGE_RATE, math.inf])
-def test_talk_with_infinite_rate_gives_every_light(at, xi, rate, function):
-    """Each light once, with probability one."""
+def test_talk_with_infinite_rate_gives_every_light(rate, function):
+    """Each light once, with probability one, whatever xi."""
     tree = make_tree(*random_lights(100))
-    for lights, p in draw_talk(tree, at, rate, 5, function, xi):
-        assert sorted(lights) == list(range(100))
-        assert set(p) == {1.0}
+    for at, xi in itertools.product(RECEIVERS.values(), (0.0, 0.5, 1 - 2.0**-24)):
+        for lights, p in draw_talk(tree, at, rate, 5, function, xi):
+            assert sorted(lights) == list(range(100))
+            assert set(p) == {1.0}
 
 
 @every_function

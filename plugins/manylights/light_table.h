@@ -104,6 +104,7 @@ public:
     /// Read all emitters of a scene
     static Table read(const Scene *scene) {
         LightTableReader reader;
+        reader.m_scene = scene;
         const auto &emitters = scene->emitters();
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
@@ -127,7 +128,9 @@ private:
         std::string_view name = emitter->class_name();
         if (surface && directional)
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
-        else if (surface && emitter->shape() && name == "AreaLight")
+        else if (surface && !emitter->shape())
+            add_unattached(emitter);
+        else if (surface && name == "AreaLight")
             add_area(emitter, emitter->shape());
         else if (name == "PointLight")
             add_point(emitter);
@@ -663,6 +666,16 @@ private:
         add_light(row, bounds);
     }
 
+    /// Some shapes (ellipsoidsmesh) do not tell their emitter about themselves
+    void add_unattached(const Emitter *emitter) {
+        add_only_hit();
+        uint32_t first = (uint32_t) m_table.light_of_primitive.size();
+        push_primitive((uint32_t) m_table.rows.size());
+        for (const auto &shape : m_scene->shapes())
+            if (shape->emitter() == emitter)
+                m_table.shapes.push_back({ shape.get(), first, 1 });
+    }
+
     /// Count a light that only rays can find
     void add_only_hit() {
         ++m_table.light_count;
@@ -790,6 +803,7 @@ private:
         m_table.bounds.push_back(bounds);
     }
 
+    const Scene *m_scene = nullptr;
     Table m_table;
     /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
