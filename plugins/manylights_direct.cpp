@@ -166,11 +166,12 @@ public:
                                           sampler->next_1d(active),
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
+        auto shading = direct.prepare(si, bsdf, u, active);
         Mask smooth  = active && has_flag(bsdf->flags(), BSDFFlags::Smooth);
         if (dr::any_or<true>(smooth))
-            result += direct.sample_lights(si, bsdf, u, smooth);
+            result += direct.sample_lights(shading, smooth);
         if (direct.needs_bsdf_samples())
-            result += direct.sample_bsdf(sampler, si, bsdf, u, active);
+            result += direct.sample_bsdf(shading, sampler, active);
         return { result, valid_ray };
     }
 

@@ -70,27 +70,34 @@ public:
                (m_lights.can_be_hit() || m_scene->environment() != nullptr);
     }
 
+    /// The shading point as BSDFs and as the tree want it, with its random numbers
+    struct Shading {
+        const SurfaceInteraction3f &si;
+        const BSDFPtr &bsdf;
+        LightSample<Float> u;
+        Receiver<FloatD> at;
+    };
+
+    Shading prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
+                    const LightSample<Float> &u, Mask active) const {
+        return { si, bsdf, u, receiver(si, bsdf, active) };
+    }
+
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
-    Spectrum sample_lights(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                           const LightSample<Float> &u, Mask active) const {
+    Spectrum sample_lights(const Shading &shading, Mask active) const {
         if (m_items == 0)
             return Spectrum(0.f);
-        Shading shading{ si, bsdf, receiver(si, bsdf, active), u.point };
-        LightSample<FloatD> ud{ plain(u.tree), plain(u.selection),
-                                Point2fD(plain(u.point.x()), plain(u.point.y())) };
-        return trace_kept(shading, keep_lights(shading, ud, active), ud.selection,
-                          active);
+        return trace_kept(shading, keep_lights(shading, active), active);
     }
 
     /// Radiance that arrives along rays sampled from the BSDF
-    Spectrum sample_bsdf(Sampler *sampler, const SurfaceInteraction3f &si,
-                         const BSDFPtr &bsdf, const LightSample<Float> &u,
-                         Mask active) const {
+    Spectrum sample_bsdf(const Shading &shading, Sampler *sampler, Mask active) const {
+        const SurfaceInteraction3f &si = shading.si;
         mitsuba::BSDFContext ctx;
         Spectrum result(0.f);
         for (uint32_t i = 0; i < m_params.bsdf_samples; ++i) {
-            auto [bs, value] = bsdf->sample(ctx, si, sampler->next_1d(active),
-                                            sampler->next_2d(active), active);
+            auto [bs, value] = shading.bsdf->sample(ctx, si, sampler->next_1d(active),
+                                                    sampler->next_2d(active), active);
             value            = si.to_world_mueller(value, -bs.wo, si.wi);
             Mask active_b =
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
@@ -100,7 +107,7 @@ public:
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
             Float light_pdf = dr::select(
-                delta, 0.f, hit_density(si, bsdf, hit, light, u, active_b && !delta));
+                delta, 0.f, hit_density(shading, hit, light, active_b && !delta));
             Float pdf = bs.pdf * (float) m_params.bsdf_samples;
             result[active_b] += value * radiance * mis_weight<Float>(pdf, light_pdf) /
                                 (float) m_params.bsdf_samples;
@@ -140,14 +147,6 @@ public:
     }
 
 private:
-    /// The shading point, as BSDFs and as the tree want it
-    struct Shading {
-        const SurfaceInteraction3f &si;
-        const BSDFPtr &bsdf;
-        Receiver<FloatD> at;
-        Point2f point;
-    };
-
     /// A light sample without visibility: F / p, and where the shadow ray leads
     struct Sample {
         Spectrum value;
@@ -171,18 +170,53 @@ private:
 
     // --------------------------------------------------------------- Stages 1 and 2
 
-    static Receiver<FloatD> receiver(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                                     Mask active) {
-        auto flags = bsdf->flags(active);
-        Vector3f n = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
-        return { plain(si.p), plain(n),
-                 plain(Mask(has_flag(flags, mitsuba::BSDFFlags::Transmission))) };
+    Receiver<FloatD> receiver(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
+                              Mask active) const {
+        Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
+        Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
+        Receiver<FloatD> at{ plain(si.p),      plain(n),    plain(si.to_world(si.wi)),
+                             plain(transmits), FloatD(1.f), FloatD(0.f),
+                             FloatD(1.f) };
+        if (m_lights.tree().glossy && !m_all)
+            measure_lobe(si, bsdf, at, active);
+        return at;
+    }
+
+    /**
+     * The glossy lobe, for any BSDF: its value and density in the mirror direction, and its
+     * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.
+     * Only h and H see this, so it does not have to be right.
+     */
+    void measure_lobe(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
+                      Receiver<FloatD> &at, Mask active) const {
+        dr::suspend_grad<Float> detached;
+        mitsuba::BSDFContext ctx;
+        Float cos_i = Frame3f::cos_theta(si.wi);
+        Vector3f mirror(-si.wi.x(), -si.wi.y(), si.wi.z());
+        // At 60 degrees from the normal and at a right angle to the plane of incidence
+        Float inv =
+            .866f * dr::rsqrt(dr::square(si.wi.x()) + dr::square(si.wi.y()) + 1e-12f);
+        Vector3f aside(-si.wi.y() * inv, si.wi.x() * inv, dr::mulsign(Float(.5f), cos_i));
+
+        auto [peak, density] = bsdf->eval_pdf(ctx, si, mirror, active);
+        Spectrum base        = bsdf->eval(ctx, si, aside, active);
+        FloatD cosine        = dr::maximum(dr::abs(plain(cos_i)), 1e-3f);
+        FloatD off = target(base) * 2.f, on = target(peak) / cosine;
+        FloatD alpha2 =
+            dr::rcp(4.f * dr::Pi<FloatD> * cosine *
+                    dr::maximum(plain(density) - cosine * dr::InvPi<FloatD>, .05f));
+        at.alpha2   = dr::clip(alpha2, 1e-5f, 1.f);
+        at.specular = dr::maximum(on - off, 0.f) * at.alpha2;
+        // The share that the lobe never takes away
+        at.diffuse = off + .01f * on + 1e-6f;
     }
 
     /// Choices are not differentiated: no gradient passes through here
-    Kept keep_lights(const Shading &shading, const LightSample<FloatD> &u,
-                     Mask active) const {
+    Kept keep_lights(const Shading &shading, Mask active) const {
         dr::suspend_grad<Float> detached;
+        LightSample<FloatD> u{ plain(shading.u.tree), plain(shading.u.selection),
+                               Point2fD(plain(shading.u.point.x()),
+                                        plain(shading.u.point.y())) };
         if (m_all)
             return keep(
                 shading,
@@ -268,7 +302,8 @@ private:
             state, [&](const State &s) { return active && s.cursor.has_next(); },
             [&](State &s) {
                 auto candidate = s.cursor.next(tree, at, s.rng);
-                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds);
+                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds,
+                                            tree.glossy);
                 s.reservoirs.add(candidate, h, m_slots, dealing, s.rng);
             },
             "Direct light: resampled candidates");
@@ -321,9 +356,9 @@ private:
 
     // ------------------------------------------------------------------------ Stage 3
 
-    Spectrum trace_kept(const Shading &shading, Kept kept, const FloatD &offset,
-                        Mask active) const {
+    Spectrum trace_kept(const Shading &shading, Kept kept, Mask active) const {
         std::vector<Sample> infinite = sample_infinite(shading, active);
+        FloatD offset                = plain(shading.u.selection);
         FloatD tau(0.f);
         if (m_choose) {
             for (size_t i = 0; i < infinite.size(); ++i)
@@ -419,7 +454,7 @@ private:
         bool others = kinds.has(LightKind::Other);
         Mask other  = others ? Mask(row.is(LightKind::Other)) : Mask(false);
         Mask table  = active && !other;
-        Point2f u   = slot_point(shading.point, slot);
+        Point2f u   = slot_point(shading.u.point, slot);
         if (dr::any_or<true>(table) && !kinds.only(LightKind::Other))
             result = sample_row(shading, row, u, inclusion, target_only, table);
         if (others) {
@@ -427,7 +462,8 @@ private:
             if (target_only) {
                 constexpr float typical_bsdf = .2f;
                 Float guess =
-                    Float(light_importance(shading.at, row, kinds)) * typical_bsdf;
+                    Float(light_importance(shading.at, row, kinds, tree.glossy)) *
+                    (tree.glossy ? 1.f : typical_bsdf);
                 dr::masked(result.value, other) =
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
             } else if (dr::any_or<true>(other)) {
@@ -511,7 +547,7 @@ private:
         std::vector<Sample> samples;
         for (const Emitter *emitter : m_lights.infinite()) {
             Point2f u =
-                slot_point(shading.point, UInt32D(m_slots + (uint32_t) samples.size()));
+                slot_point(shading.u.point, UInt32D(m_slots + (uint32_t) samples.size()));
             samples.push_back(sample_emitter(shading, emitter, u, Float(1.f), active));
         }
         return samples;
@@ -572,21 +608,21 @@ private:
     // ------------------------------------------------------------------------- Density
 
     /// Density of the light side for the direction that hit `light` or the environment
-    Float hit_density(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                      const SurfaceInteraction3f &hit, const UInt32D &light,
-                      const LightSample<Float> &u, Mask active) const {
+    Float hit_density(const Shading &shading, const SurfaceInteraction3f &hit,
+                      const UInt32D &light, Mask active) const {
+        const SurfaceInteraction3f &si = shading.si;
+        const Receiver<FloatD> &at     = shading.at;
         Float result(0.f);
         Mask found = active && light < kOnlyHit;
         if (m_lights.can_be_hit() && dr::any_or<true>(found)) {
             dr::suspend_grad<Float> detached;
-            const auto &tree    = m_lights.tree();
-            Row<FloatD> row     = tree.row(light, plain(found));
-            Receiver<FloatD> at = receiver(si, bsdf, active);
-            FloatD pdf = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
+            const auto &tree = m_lights.tree();
+            Row<FloatD> row  = tree.row(light, plain(found));
+            FloatD pdf       = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
                 return light_pdf<FloatD>(row, kind, at.p, plain(hit.p),
                                          plain(Vector3f(hit.n)));
             });
-            result     = Float(pdf);
+            result           = Float(pdf);
             if (tree.kinds.has(LightKind::Other)) {
                 Mask other = found && row.is(LightKind::Other);
                 if (dr::any_or<true>(other)) {
@@ -595,8 +631,8 @@ private:
                         emitter_of(row)->pdf_direction(si, ds, other);
                 }
             }
-            result *=
-                Float(inclusion_probability(at, light, plain(u.tree), plain(found)));
+            result *= Float(
+                inclusion_probability(at, light, plain(shading.u.tree), plain(found)));
             result = dr::select(found, result, 0.f);
         }
         Mask missed = active && !hit.is_valid();

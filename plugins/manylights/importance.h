@@ -26,13 +26,35 @@ template <typename Float> struct Receiver {
     using Mask     = dr::mask_t<Float>;
 
     Point3f p;
-    /// Unit normal on the side from which the point is seen
-    Vector3f n;
+    /// Unit normal on the side from which the point is seen, and the direction back
+    Vector3f n, wi;
     /// Can light arrive from behind as well?
     Mask transmits;
+    /// Reflectance off the lobe, peak of the lobe times alpha^2, and alpha^2 (GGX); used
+    /// only in scenes with glossy surfaces
+    Float diffuse, specular, alpha2;
 
-    DRJIT_STRUCT(Receiver, p, n, transmits)
+    DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2)
 };
+
+/**
+ * Reflectance of the measured lobe towards the direction w / |w|, widened by the angle that
+ * a cluster of the given variance fills:
+ *
+ *     diffuse + peak alpha^2 a / ((n.h)^2 (a - 1) + 1)^2,   a = alpha^2 + variance / (2 e^2)
+ *
+ * with h the half vector, (n.h)^2 = (n.w / e + n.wi)^2 / (2 + 2 wi.w / e).
+ */
+template <typename Float, typename Value>
+Value lobe(const Receiver<Float> &at, const Value &cos_o, const Value &dot_wi,
+           const Value &spread2) {
+    Float cos_i = dr::dot(at.n, at.wi);
+    Value cos_h2 =
+        dr::minimum(dr::square(cos_o + cos_i) * dr::rcp(2.001f + 2.f * dot_wi), 1.f);
+    Value a = dr::minimum(.5f * spread2 + at.alpha2, 1.f);
+    Value d = dr::fmadd(cos_h2, a - 1.f, 1.f);
+    return a * at.specular * dr::rcp(d * d) + at.diffuse;
+}
 
 /// The part of a wide node that the importance needs, for its four children
 template <typename Float> struct Clusters {
@@ -53,11 +75,12 @@ constexpr float kCosineRounding = 1e-6f;
  *     o = -a.w / e                                              a: mean emission axis
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
- * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1.
+ * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1;
+ * with `glossy` surfaces in the scene h is multiplied with the receiver's \ref lobe.
  */
 template <typename Float>
 Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,
-                               bool oriented) {
+                               bool oriented, bool glossy) {
     using F4 = Four<Float>;
     F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
     F4 e2 = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
@@ -69,6 +92,11 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
         .5f * (t + dr::sqrt(dr::fmadd(t, t, dr::fmadd(kCosineRounding, e2, c.variance))));
 
     F4 importance = c.flux * ie2 * cosine * ie;
+    if (glossy) {
+        F4 dot_wi =
+            dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
+        importance *= lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2));
+    }
     if (!oriented)
         return importance;
     F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * ie;
@@ -202,15 +230,21 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
  * spot's cone.
  */
 template <typename Float>
-Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds) {
+Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds,
+                       bool glossy) {
     Appearance<Float> a = by_kind<Appearance<Float>>(
         row, kinds, [&](LightKind kind) { return appearance(at, row, kind); });
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
     Float t      = dr::dot(at.n, a.w);
     t            = dr::select(at.transmits, dr::abs(t), t);
     Float cosine = .5f * (t + dr::sqrt(t * t + a.variance)) * inv_d;
+    Float reflectance(1.f);
+    if (glossy)
+        reflectance =
+            lobe(at, Float(dr::dot(at.n, a.w) * inv_d),
+                 Float(dr::dot(at.wi, a.w) * inv_d), Float(a.variance * inv_d * inv_d));
     return row[kLuminance] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d *
-           inv_d;
+           inv_d * reflectance;
 }
 
 } // namespace manylights

@@ -104,7 +104,7 @@ public:
     /// Read all emitters of a scene
     static Table read(const Scene *scene) {
         LightTableReader reader;
-        reader.m_scene = scene;
+        reader.m_scene       = scene;
         const auto &emitters = scene->emitters();
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);

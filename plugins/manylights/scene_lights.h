@@ -7,8 +7,9 @@
 
 #include "emission.h"
 #include "light_table.h"
-#include <drjit/tensor.h>
 #include <chrono>
+#include <drjit/tensor.h>
+#include <mitsuba/render/bsdf.h>
 #include <unordered_map>
 
 namespace manylights {
@@ -121,7 +122,7 @@ public:
     };
 
     SceneLights(const Scene *scene, bool keep_binary) {
-        auto start = std::chrono::steady_clock::now();
+        auto start                 = std::chrono::steady_clock::now();
         auto table                 = LightTableReader<Float, Spectrum>::read(scene);
         LightTree tree             = build_tree(table.bounds, keep_binary);
         std::vector<LightRow> rows = ordered_rows(table, tree);
@@ -133,6 +134,9 @@ public:
         for (const LightBounds &bounds : table.bounds)
             m_tree.oriented |=
                 bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0;
+        for (const auto &shape : scene->shapes())
+            m_tree.glossy |= shape->bsdf() &&
+                             has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy);
         m_tree.light_count = (uint32_t) rows.size();
         m_tree.nodes =
             upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
@@ -153,7 +157,8 @@ public:
                              dr::width(m_tree.rows) + dr::width(m_light_of_primitive) +
                              dr::width(m_shape_lights));
         m_statistics.build_ms = std::chrono::duration<float, std::milli>(
-                                    std::chrono::steady_clock::now() - start).count();
+                                    std::chrono::steady_clock::now() - start)
+                                    .count();
     }
 
     static Fingerprint<Float> fingerprint(const Scene *scene) {

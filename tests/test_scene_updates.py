@@ -1,0 +1,482 @@
+"""The tree belongs to the scene as it is now: updates, several scenes and sensors, nesting.
+
+After a change, images of an integrator that has seen the scene before must be equal, bit for bit,
+to those of a new integrator, and have the mean that Mitsuba's `direct` finds. A stale tree would
+give the image from before the change; each test shows that this one is significantly different.
+"""
+
+import gc
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests import light_scenes
+from tests import statistics_tools as tools
+from tests.references import planned_images
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+
+ERROR = 3e-3
+"""Relative standard error of an image mean that the number of samples is chosen for."""
+
+BIAS = 0.05
+"""Smallest bias that has to be found: 8 standard errors of the difference are 3.4 %.
+
+Changes of the scenes below are much larger, and the mean of what a new tree gives is tested in
+`test_unbiased.py`.
+"""
+
+
+def light_tree(**parameters):
+    """The integrator under test."""
+    return mi.load_dict({"type": "manylights_direct", **parameters})
+
+
+def reference(**parameters):
+    """Mitsuba's own."""
+    return mi.load_dict({"type": "direct", "emitter_samples": 1, **parameters})
+
+
+def image(scene, integrator, seed=5, spp=4, sensor=0):
+    """One noisy image, for comparisons bit by bit."""
+    return np.array(mi.render(scene, integrator=integrator, seed=seed, spp=spp, sensor=sensor))
+
+
+def assert_current(scene, integrator, fresh=light_tree, sensor=0):
+    """The integrator renders what a new one renders, bit for bit."""
+    found, expected = (image(scene, i, sensor=sensor) for i in (integrator, fresh()))
+    assert np.array_equal(found, expected)
+
+
+def assert_right_mean(scene, integrator, known=None, label="", channels=slice(None)):
+    """The images have the mean of the reference's; returns both."""
+    images = planned_images(scene, integrator, ERROR, first_seed=0)
+    expected = planned_images(scene, known or reference(), ERROR, first_seed=100_000)
+    images, expected = images[..., channels], expected[..., channels]
+    tools.assert_same_mean(images, expected, bias=BIAS, label=label)
+    return images, expected
+
+
+# ----------------------------------------------------------------------------------------- changes
+
+
+def scaled(scene, key, factor):
+    """Multiply a parameter."""
+    parameters = mi.traverse(scene)
+    parameters[key] = factor * parameters[key]
+    parameters.update()
+
+
+def matching(parameters, pattern):
+    """The names of parameters that match."""
+    return [name for name, _ in parameters.items() if re.fullmatch(pattern, name)]
+
+
+def brighter_point(scene):
+    """One of 200 lights gets forty times as bright."""
+    scaled(scene, "point_7.intensity.value", 40)
+
+
+def lower_points(scene):
+    """Forty of 200 lights move towards the floor."""
+    parameters = mi.traverse(scene)
+    for index in range(40):
+        x, y, z = np.ravel(parameters[f"point_{index}.position"])
+        parameters[f"point_{index}.position"] = [float(x), float(y), float(z) - 0.8]
+    parameters.update()
+
+
+def turned_spots(scene):
+    """Twenty of 60 spots move, and aim at the same point."""
+    parameters = mi.traverse(scene)
+    look_at = mi.ScalarTransform4f().look_at([0.3, -0.5, 2.0], [0.3, -0.6, 0], [0, 1, 0])
+    for index in range(20):
+        parameters[f"spot_{index}.to_world"] = look_at
+    parameters.update()
+
+
+def wider_spot(scene):
+    """A spot opens, and loses its soft border."""
+    parameters = mi.traverse(scene)
+    for index in range(0, 60, 2):
+        parameters[f"spot_{index}.cutoff_angle"] = 70.0
+        parameters[f"spot_{index}.beam_width"] = 65.0
+    parameters.update()
+
+
+def lower_mesh(scene):
+    """All vertices of an emissive mesh move towards the middle of the floor."""
+    parameters = mi.traverse(scene)
+    vertices = np.array(parameters["lamps.vertex_positions"]).reshape(-1, 3)
+    moved = (vertices * (0.8, 0.8, 0.6)).astype(np.float32)
+    parameters["lamps.vertex_positions"] = np.ravel(moved)
+    parameters.update()
+
+
+def brighter_mesh(scene):
+    """The radiance of a whole mesh."""
+    (key,) = matching(mi.traverse(scene), r"lamps.*radiance\.value")
+    scaled(scene, key, 1.5)
+
+
+def other_face_colours(scene):
+    """Triangles of a mesh exchange their radiance, and each fifth gets brighter."""
+    parameters = mi.traverse(scene)
+    colours = np.array(parameters["lamps.face_color"]).reshape(-1, 3)[::-1].copy()
+    colours[::5] *= 4
+    parameters["lamps.face_color"] = np.ravel(colours)
+    parameters.update()
+
+
+def other_texture(scene):
+    """The bitmaps on rectangles and disks: upside down, and brighter in one half.
+
+    Mitsuba makes one object of equal textures, and lists it under one of the lights.
+    """
+    parameters = mi.traverse(scene)
+    keys = matching(parameters, r".*radiance\.data")
+    assert keys
+    for key in keys:
+        data = np.array(parameters[key])[::-1].copy()
+        data[:4] *= 2
+        parameters[key] = mi.TensorXf(data)
+    parameters.update()
+
+
+def moved_shapes(kind):
+    """A change that moves each fourth shape to a place near the floor."""
+
+    def change(scene):
+        parameters = mi.traverse(scene)
+        for index in range(0, 16, 4):
+            frame = mi.ScalarTransform4f().translate([0.3 * index / 4 - 0.5, -0.8, 0.9])
+            frame = frame.rotate([1, 0, 0], 180).scale(0.15)
+            parameters[f"{kind}_{index}.to_world"] = frame
+        parameters.update()
+
+    return change
+
+
+def brighter_sky(scene):
+    """A light that is not in the tree."""
+    scaled(scene, "sky.radiance.value", 3)
+
+
+def with_shapes(kind):
+    """Sixteen area lights on shapes of one kind."""
+    return lambda: {**light_scenes.stage(), **light_scenes.shapes(kind)}
+
+
+SCENES = light_scenes.SCENES
+CHANGES = {
+    "intensity": (SCENES["points"], brighter_point),
+    "position": (SCENES["points"], lower_points),
+    "spot-direction": (SCENES["spots"], turned_spots),
+    "spot-angle": (SCENES["spots"], wider_spot),
+    "vertices": (SCENES["mesh-constant"], lower_mesh),
+    "radiance": (SCENES["mesh-constant"], brighter_mesh),
+    "face-colours": (SCENES["mesh-face-colours"], other_face_colours),
+    "texture": (SCENES["textured"], other_texture),
+    "rectangles": (with_shapes("rectangle"), moved_shapes("rectangle")),
+    "spheres": (with_shapes("sphere"), moved_shapes("sphere")),
+    "sky": (SCENES["sky"], brighter_sky),
+}
+
+
+def load(name):
+    """A new scene that the change belongs to."""
+    return mi.load_dict(CHANGES[name][0]())
+
+
+def reference_of(name):
+    """Mitsuba samples lights with face colours wrongly, but hits them."""
+    return reference(emitter_samples=0) if name == "face-colours" else reference()
+
+
+@both_variants
+@pytest.mark.parametrize("method", ["resampled_tree", "talk"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_update_is_seen(variant, name, method):
+    """The same integrator, before and after the update; a second render changes nothing."""
+    scene, integrator = load(name), light_tree(method=method)
+    before = image(scene, integrator)
+    CHANGES[name][1](scene)
+    assert_current(scene, integrator, lambda: light_tree(method=method))
+    assert not np.array_equal(before, image(scene, integrator))
+
+
+@both_variants
+@pytest.mark.parametrize("name", CHANGES)
+def test_mean_after_update(variant, name):
+    """It is that of `direct`, and that of the images before the update is not."""
+    scene, integrator = load(name), light_tree()
+    before = planned_images(scene, integrator, ERROR, first_seed=0)
+    CHANGES[name][1](scene)
+    _, expected = assert_right_mean(scene, integrator, reference_of(name), f"{name}, {variant}")
+    assert not tools.compare_means(before, expected).passes
+
+
+@both_variants
+def test_change_and_return(variant):
+    """Old parameters give the old image back."""
+    scene, integrator = load("intensity"), light_tree()
+    before = image(scene, integrator)
+    for factor in (40, 1 / 40):
+        scaled(scene, "point_7.intensity.value", factor)
+        assert_current(scene, integrator)
+    np.testing.assert_allclose(image(scene, integrator), before, rtol=1e-3, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------ scenes and sensors
+
+
+@both_variants
+def test_scenes_in_turn(variant):
+    """One integrator, three scenes: none takes another one's lights."""
+    names = ("intensity", "vertices", "spheres")
+    scenes, integrator = [load(name) for name in names], light_tree()
+    expected = [image(scene, light_tree()) for scene in scenes]
+    for index in (0, 1, 0, 1, 2, 0, 2, 1):
+        assert np.array_equal(image(scenes[index], integrator), expected[index])
+
+
+@both_variants
+def test_update_of_one_of_two_scenes(variant):
+    """The other scene keeps its tree."""
+    scenes, integrator = [load("intensity"), load("intensity")], light_tree()
+    first = [image(scene, integrator) for scene in scenes]
+    brighter_point(scenes[0])
+    assert_current(scenes[0], integrator)
+    assert np.array_equal(image(scenes[1], integrator), first[1])
+
+
+@both_variants
+@pytest.mark.parametrize("nesting", [None, "aov", "moment"])
+def test_new_scene_after_the_old_one_is_deleted(variant, nesting):
+    """A new scene may lie where the old one lay in memory."""
+    integrator = nested(nesting, light_tree())
+    for factor in (1, 3, 9, 27, 81):
+        description = CHANGES["intensity"][0]()
+        for index in range(200):
+            colour = description[f"point_{index}"]["intensity"]["value"]
+            description[f"point_{index}"]["intensity"]["value"] = [factor * c for c in colour]
+        scene = mi.load_dict(description)
+        assert_current(scene, integrator, lambda: nested(nesting, light_tree()))
+        del scene, description
+        gc.collect()
+
+
+@both_variants
+def test_several_sensors(variant):
+    """Each sensor of a scene, one after the other, before and after an update."""
+    description = SCENES["points"]()
+    look_at = mi.ScalarTransform4f().look_at([3, -2, 2], [0, 0, 0.2], [0, 0, 1])
+    description["other"] = {**light_scenes.sensor(), "to_world": look_at}
+    scene, integrator = mi.load_dict(description), light_tree()
+    for _ in range(2):
+        images = []
+        for sensor in (0, 1, 0):
+            assert_current(scene, integrator, sensor=sensor)
+            images.append(image(scene, integrator, sensor=sensor))
+        assert np.array_equal(images[0], images[2])
+        assert not np.array_equal(images[0], images[1])
+        brighter_point(scene)
+
+
+# ----------------------------------------------------------------------------------------- nesting
+
+
+def nested(kind, integrator):
+    """The integrator inside another one, or itself."""
+    if kind == "aov":
+        return mi.load_dict({"type": "aov", "aovs": "distance:depth", "image": integrator})
+    if kind == "moment":
+        return mi.load_dict({"type": "moment", "image": integrator})
+    return integrator
+
+
+both_nestings = pytest.mark.parametrize("nesting", ["aov", "moment"])
+
+
+@both_variants
+@both_nestings
+def test_update_is_seen_under_nesting(variant, nesting):
+    """`aov` calls `render` of the inner integrator, `moment` only its `sample`."""
+    scene, integrator = load("position"), nested(nesting, light_tree())
+    before = image(scene, integrator)
+    lower_points(scene)
+    assert_current(scene, integrator, lambda: nested(nesting, light_tree()))
+    assert not np.array_equal(before, image(scene, integrator))
+
+
+@both_variants
+@both_nestings
+def test_mean_under_nesting(variant, nesting):
+    """After an update, against `direct` under the same nesting; second moments may differ."""
+    scene, integrator = load("position"), nested(nesting, light_tree())
+    image(scene, integrator)
+    lower_points(scene)
+    known = nested(nesting, reference())
+    assert_right_mean(scene, integrator, known, f"{nesting}, {variant}", channels=slice(0, 3))
+
+
+# ----------------------------------------------------------------------------------------- freezing
+
+
+@pytest.mark.parametrize("seen", [False, True], ids=["new scene", "scene rendered before"])
+def test_freezing_is_refused(llvm, seen):
+    """The message says what cannot be done and what to do instead."""
+    scene, integrator = load("intensity"), light_tree()
+    if seen:
+        image(scene, integrator)
+
+    @dr.freeze
+    def frozen():
+        return mi.render(scene, integrator=integrator, spp=1)
+
+    with pytest.raises(RuntimeError) as raised:
+        frozen()
+    text = full_text(raised.value)
+    assert "dr.freeze" in text
+    assert "mi.render outside of the frozen function" in text
+    assert_current(scene, integrator)
+
+
+def full_text(error):
+    """The messages of an exception and of its causes."""
+    texts = []
+    while error is not None:
+        texts.append(str(error))
+        error = error.__cause__ or error.__context__
+    return "\n".join(texts)
+
+
+# ------------------------------------------------------------------------------ published numbers
+
+KEYS = ("lights", "lights_in_tree", "nodes", "depth", "bytes", "build_ms")
+
+
+@both_variants
+def test_numbers_of_the_tree(variant):
+    """Zero before the first render, then those of the current scene; read-only."""
+    integrator = light_tree()
+    assert [mi.traverse(integrator)[key] for key in KEYS] == [0] * len(KEYS)
+    for name, lights, in_tree in (("intensity", 200, 200), ("vertices", 100, 100)):
+        image(load(name), integrator)
+        numbers = {key: mi.traverse(integrator)[key] for key in KEYS}
+        assert (numbers["lights"], numbers["lights_in_tree"]) == (lights, in_tree)
+        assert lights / 4 <= numbers["nodes"] < lights
+        assert 4 <= numbers["depth"] <= 64
+        assert numbers["bytes"] >= 128 * numbers["nodes"] + 64 * lights
+        assert 0 < numbers["build_ms"] < 1e4
+
+
+@both_variants
+def test_lights_at_infinity_are_not_in_the_tree(variant):
+    """They count as lights."""
+    scene, integrator = load("sky"), light_tree()
+    image(scene, integrator)
+    numbers = mi.traverse(integrator)
+    at_infinity = [e for e in scene.emitters() if mi.has_flag(e.flags(), mi.EmitterFlags.Infinite)]
+    assert numbers["lights"] == len(scene.emitters())
+    assert numbers["lights"] - numbers["lights_in_tree"] == len(at_infinity) > 0
+
+
+@both_variants
+@pytest.mark.parametrize("key", KEYS)
+def test_numbers_cannot_be_changed(variant, key):
+    """Mitsuba refuses to set them."""
+    parameters = mi.traverse(light_tree())
+    assert parameters.flags(key) & mi.ParamFlags.ReadOnly
+    with pytest.raises(Exception, match=r"(?i)read-only"):
+        parameters[key] = 1
+
+
+@both_variants
+def test_text_of_the_integrator(variant):
+    """Every parameter by name and value, and the tree once there is one."""
+    values = {"splitting_rate": 2.5, "reservoirs": 5, "shadow_rays": 3, "bsdf_samples": 0}
+    integrator = light_tree(**values, hide_emitters=True)
+    assert_text(integrator, **values, hide_emitters="true", method="resampled_tree")
+    assert "not built yet" in str(integrator)
+    assert "split_function" not in str(integrator)
+    image(load("intensity"), integrator)
+    assert "lights = 200, lights_in_tree = 200, nodes = " in str(integrator)
+    assert_text(light_tree(splitting_rate=float("inf")), splitting_rate="inf")
+    assert_text(light_tree(method="talk", split_function="far"), split_function="far")
+
+
+def assert_text(integrator, **values):
+    """`name = value` is in what `print` shows."""
+    lines = [line.strip().rstrip(",") for line in str(integrator).splitlines()]
+    for name, value in values.items():
+        assert f"{name} = {value}" in lines
+
+
+# ------------------------------------------------------------------------------ invalid parameters
+
+INVALID = [
+    ({"splitting_rate": -1}, ["splitting_rate", "-1", ">= 0"]),
+    ({"splitting_rate": float("nan")}, ["splitting_rate", "nan", ">= 0"]),
+    ({"splitting_rate": float("-inf")}, ["splitting_rate", "-inf", ">= 0"]),
+    ({"splitting_rate": "many"}, ["splitting_rate", '"many"', '"inf"']),
+    ({"splitting_rate": True}, ["splitting_rate", "expected float", "boolean"]),
+    ({"reservoirs": 0}, ["reservoirs", " 0,", "from 1 to 64"]),
+    ({"reservoirs": -3}, ["reservoirs", "-3", "from 1 to 64"]),
+    ({"reservoirs": 65}, ["reservoirs", "65", "from 1 to 64"]),
+    ({"reservoirs": 2.5}, ["reservoirs", "expected integer", "float"]),
+    ({"reservoirs": "8"}, ["reservoirs", "expected integer", "string"]),
+    ({"shadow_rays": 0}, ["shadow_rays", " 0,", "from 1 to"]),
+    ({"shadow_rays": -2}, ["shadow_rays", "-2", "from 1 to"]),
+    ({"reservoirs": 4, "shadow_rays": 5}, ["shadow_rays", " 5,", "from 1 to 4"]),
+    ({"bsdf_samples": -1}, ["bsdf_samples", "-1", "from 0 to"]),
+    ({"hide_emitters": "yes"}, ["hide_emitters", "expected boolean", "string"]),
+    ({"method": "best"}, ["method", '"best"', '"resampled_tree" or "talk"']),
+    ({"method": 3}, ["method", "expected string", "integer"]),
+    ({"split_function": "near"}, ["split_function", '"near"', "unless", "method"]),
+    ({"method": "talk", "split_function": "middle"}, ["split_function", '"middle"', '"near" or']),
+    ({"reservoir": 3}, ["unreferenced", '"reservoir": 3']),
+]
+VALID = [
+    {"splitting_rate": 0},
+    {"splitting_rate": 1},
+    {"splitting_rate": "inf"},
+    {"splitting_rate": float("inf")},
+    {"reservoirs": 1},
+    {"reservoirs": 64, "shadow_rays": 64},
+    {"bsdf_samples": 0},
+    {"method": "talk"},
+    {"method": "talk", "split_function": "near"},
+]
+
+
+def parameter_id(parameters):
+    """A readable test id."""
+    return ",".join(f"{name}={value}" for name, value in parameters.items())
+
+
+@both_variants
+@pytest.mark.parametrize(
+    ("parameters", "words"), INVALID, ids=[parameter_id(parameters) for parameters, _ in INVALID]
+)
+def test_invalid_parameter_is_refused(variant, parameters, words):
+    """The message has the name, the value and what is allowed."""
+    with pytest.raises(RuntimeError) as raised:
+        light_tree(**parameters)
+    assert "manylights_direct" in str(raised.value)
+    for word in words:
+        assert word in str(raised.value)
+
+
+@both_variants
+@pytest.mark.parametrize("parameters", VALID, ids=parameter_id)
+def test_valid_parameter_renders(variant, parameters):
+    """The borders of the ranges work."""
+    result = image(load("intensity"), light_tree(**parameters), spp=1)
+    assert np.isfinite(result).all()
+    assert result.mean() > 0
