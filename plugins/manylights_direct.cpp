@@ -15,7 +15,7 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
 
  * - splitting_rate
    - |float|
-   - How many lights are considered at each shading point: about 24 times this number,
+   - How many lights are considered at each shading point: about 8 times this number,
      from 0 (a single random descent of the tree) to infinity (:code:`inf`: every light).
      (Default: 1)
 
@@ -68,7 +68,7 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
 1. one random number cuts a tree of the lights into :math:`N'` candidates. Let
    :math:`w_l(x)` be the probability that a random descent of the tree, steered by a cheap
    bound :math:`h` of the light that a cluster may send to :math:`x`, ends at light
-   :math:`l`. With :math:`K = 24 \cdot` :code:`splitting_rate` points at equal distances,
+   :math:`l`. With :math:`K = 8 \cdot` :code:`splitting_rate` points at equal distances,
    :math:`l` becomes a candidate with probability :math:`p_l = \min(1, K w_l)`;
 
 2. the candidates are resampled with a heuristic :math:`H` of single lights to at most
@@ -131,6 +131,7 @@ public:
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium, BSDF, BSDFPtr)
     using Lights      = manylights::SceneLights<Float, Spectrum>;
     using DirectLight = manylights::DirectLight<Float, Spectrum>;
+    using Cache       = manylights::LightCache<Float, Spectrum>;
 
     ManyLightsDirect(const Properties &props)
         : Base(props), m_params(manylights::read_parameters(props)),
@@ -138,7 +139,7 @@ public:
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
                     bool evaluate) override {
-        m_cache.update(scene);
+        typename Cache::Rendering guard(m_cache, scene);
         return Base::render(scene, sensor, seed, spp, develop, evaluate);
     }
 
@@ -146,7 +147,7 @@ public:
                                      const RayDifferential3f &ray, const Medium *,
                                      Float *, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
-        DirectLight direct(scene, m_cache.get(scene), m_params);
+        DirectLight direct(scene, m_cache.get(scene, sampler), m_params);
 
         SurfaceInteraction3f si =
             scene->ray_intersect(ray, +RayFlags::All, /* coherent = */ true, active);
@@ -210,7 +211,7 @@ private:
     }
 
     manylights::SamplingParameters m_params;
-    manylights::LightCache<Float, Spectrum> m_cache;
+    Cache m_cache;
 };
 
 MANYLIGHTS_EXPORT_PLUGIN(ManyLightsDirect)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -51,7 +52,9 @@ def run_python(script, *arguments, **environment):
         check=False,
     )
     assert process.returncode == 0, process.stdout + process.stderr
-    return json.loads(process.stdout.splitlines()[-1])
+    # Mitsuba's log may leave a colour code at the beginning of the line
+    line = process.stdout.splitlines()[-1]
+    return json.loads(re.sub("\x1b\\[[0-9;]*m", "", line))
 
 
 @pytest.mark.usefixtures("plugin")

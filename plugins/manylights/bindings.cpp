@@ -182,7 +182,7 @@ Choices resample(const Numbers &importance, const Numbers &probability,
     Reservoirs<float> kept(reservoirs);
     Rng rng(1, seed);
     for (uint32_t i = 0; i < importance.shape(0); ++i)
-        kept.add({ i, probability(i), true, 0 }, importance(i), reservoirs,
+        kept.add({ i, probability(i), true }, importance(i), reservoirs,
                  greedy ? Dealing::Greedy : Dealing::Random, rng);
     Choices result;
     for (uint32_t k = 0; k < reservoirs; ++k) {

@@ -27,14 +27,12 @@ template <typename Float> struct Candidate {
     UInt32 light;
     Float probability;
     Mask valid;
-    /// Nodes visited on the way (statistics only; dead code in a kernel)
-    UInt32 visits;
 };
 
 /// Largest float below 1
 constexpr float kBelowOne = 0x1.fffffep-1f;
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
-constexpr float kMaxExpectedCandidates = 1 << 20;
+constexpr float kMaxExpectedCandidates = 1 << 14;
 /// K for a splitting rate of 1
 constexpr float kCandidatesPerRate = 8.f;
 
@@ -48,7 +46,7 @@ template <typename Float> struct AllLights {
 
     template <typename Rng>
     Candidate<Float> next(const TreeView<Float> &, const Receiver<Float> &, Rng &) {
-        Candidate<Float> result{ index, Float(1.f), true, UInt32(0) };
+        Candidate<Float> result{ index, Float(1.f), true };
         index += 1u;
         return result;
     }
@@ -83,12 +81,14 @@ template <typename Float> struct SystematicCursor {
     Float expected, offset, k;
     /// Remembered nodes, the deepest first; width 0 marks an empty entry
     Place trail0, trail1;
-    DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1)
+    UInt32 last_leaf;
+    DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1, last_leaf)
 
     SystematicCursor(const Float &expected, const Float &u)
-        : expected(expected), offset(u), k(0.f), trail0(root(0.f)), trail1(root(0.f)) {}
+        : expected(expected), offset(u), k(0.f), trail0(root(0.f)), trail1(root(0.f)),
+          last_leaf(kNone) {}
 
-    Mask has_next() const { return holds(k, Float(1.f)); }
+    Mask has_next() const { return holds(root(1.f), k); }
 
     template <typename Rng>
     Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at,
@@ -96,17 +96,14 @@ template <typename Float> struct SystematicCursor {
         struct Descent {
             Place place, trail0, trail1;
             Float x, dither;
-            UInt32 visits;
-            DRJIT_STRUCT(Descent, place, trail0, trail1, x, dither, visits)
+            DRJIT_STRUCT(Descent, place, trail0, trail1, x, dither)
         };
 
-        Mask remembered = trail0.width > 0.f;
+        // By rounding, a remembered node may miss the point by a hair: then start at the root
+        Mask remembered = trail0.width > 0.f && holds(trail0, k);
         Descent d{ dr::select(remembered, trail0, root(1.f)),
-                   dr::select(remembered, trail1, trail0),
-                   root(0.f),
-                   Float(0.f),
-                   rng.template next_float<Float>(),
-                   UInt32(0) };
+                   dr::select(remembered, trail1, root(0.f)), root(0.f), Float(0.f),
+                   rng.template next_float<Float>() };
         d.x = inside(((k + offset) / expected - d.place.lower) / d.place.width);
 
         loop(
@@ -116,17 +113,21 @@ template <typename Float> struct SystematicCursor {
         trail0 = d.trail0;
         trail1 = d.trail1;
         k      = next_point(d.place.lower + d.place.width);
+        Mask same =
+            d.place.node == last_leaf; // two points on the same border, by rounding
+        last_leaf = d.place.node;
         return { d.place.node & ~kLeafBit, dr::minimum(1.f, expected * d.place.width),
-                 true, d.visits };
+                 !same };
     }
 
 private:
     static Place root(const Float &width) { return { UInt32(0), Float(0.f), width }; }
     static Float inside(const Float &x) { return dr::clip(x, 0.f, kBelowOne); }
 
-    /// Does point k lie below `end`?
-    Mask holds(const Float &k, const Float &end) const {
-        return k + offset < expected * end;
+    /// Does point k lie in the interval of a place?
+    Mask holds(const Place &place, const Float &k) const {
+        Float x = k + offset;
+        return x >= expected * place.lower && x < expected * (place.lower + place.width);
     }
 
     /// First point at or beyond `end`, and at least one further than the current one
@@ -144,10 +145,10 @@ private:
                      choice.probability * s.place.width };
 
         // Remember this node if it holds a point beyond the child (the root needs no place)
-        Mask push = s.place.node != 0u && holds(next_point(child.lower + child.width),
-                                                s.place.lower + s.place.width);
-        s.trail1  = dr::select(push, s.trail0, s.trail1);
-        s.trail0  = dr::select(push, s.place, s.trail0);
+        Mask push =
+            s.place.node != 0u && holds(s.place, next_point(child.lower + child.width));
+        s.trail1 = dr::select(push, s.trail0, s.trail1);
+        s.trail0 = dr::select(push, s.place, s.trail0);
 
         s.x = inside((s.x - choice.lower) / choice.probability);
         /* A descent magnifies the rounding of x. Where the interval becomes too small for a
@@ -156,7 +157,6 @@ private:
         Float x     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
         s.x = dr::select(single, inside(x - dr::select(x >= 1.f, Float(1.f), 0.f)), s.x);
         s.place = child;
-        s.visits += 1u;
     }
 };
 
@@ -198,11 +198,10 @@ template <typename Float> struct StochasticCursor {
             UInt32 node, resume;
             Float x, probability;
             Mask cut;
-            UInt32 visits;
-            DRJIT_STRUCT(Descent, node, resume, x, probability, cut, visits)
+            DRJIT_STRUCT(Descent, node, resume, x, probability, cut)
         };
         Descent d{ node,       UInt32(0),   rng.template next_float<Float>(),
-                   Float(1.f), Mask(false), UInt32(0) };
+                   Float(1.f), Mask(false) };
         d.resume = node;
         loop(
             d, [](const Descent &s) { return (s.node & kLeafBit) == 0u; },
@@ -223,11 +222,10 @@ template <typename Float> struct StochasticCursor {
                 s.probability = dr::select(step, s.probability * q, s.probability);
                 s.node        = dr::select(leaf, view.light | kLeafBit,
                                            dr::select(left, s.node + 1u, view.right));
-                s.visits += 1u;
             },
             "Light tree: stochastic splitting");
         node = d.resume;
-        return { d.node & ~kLeafBit, d.probability, d.probability > 0.f, d.visits };
+        return { d.node & ~kLeafBit, d.probability, d.probability > 0.f };
     }
 
     /// Probability that `light` is a candidate, given this traversal's xi
@@ -285,7 +283,7 @@ private:
         Float spread2 = dr::clip(r2 / d2, kMinSpread * kMinSpread, 1e12f);
         Float g = rate * (function == SplitFunction::Near ? spread2 : dr::sqrt(spread2));
         // The root's box holds all others, so P decreases with depth on every path
-        return dr::select(d2 > 0.f, g / (1.f + g),
+        return dr::select(d2 > 0.f, 1.f - dr::rcp(1.f + g),
                           dr::select(rate > 0.f, Float(1.f), 0.f));
     }
 

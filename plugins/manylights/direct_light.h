@@ -264,19 +264,18 @@ private:
             [&](const State &s) { return on && s.cursor.has_next() && s.slot < m_slots; },
             [&](State &s) {
                 auto candidate = s.cursor.next(m_lights.tree(), shading.at, s.rng);
-                FloatD weight  = dr::rcp(candidate.probability);
-                Kept &kept     = s.kept;
-                write_slot<UInt32D>(kept.light, s.slot, candidate.light, m_slots, true);
-                write_slot<FloatD>(kept.weight, s.slot, weight, m_slots, true);
-                write_slot<FloatD>(kept.probability, s.slot, candidate.probability,
-                                   m_slots, true);
-                if (m_choose)
-                    write_slot<FloatD>(kept.target, s.slot,
-                                       weight * light_target(shading, candidate.light,
-                                                             candidate.probability,
-                                                             s.slot, active),
-                                       m_items, true);
-                s.slot += 1u;
+                FloatD p = candidate.probability, weight = dr::rcp(p);
+                MaskD valid = candidate.valid;
+                Kept &kept  = s.kept;
+                write_slot<UInt32D>(kept.light, s.slot, candidate.light, m_slots, valid);
+                write_slot<FloatD>(kept.weight, s.slot, weight, m_slots, valid);
+                write_slot<FloatD>(kept.probability, s.slot, p, m_slots, valid);
+                if (m_choose) {
+                    FloatD g = light_target(shading, candidate.light, p, s.slot,
+                                            active && valid);
+                    write_slot<FloatD>(kept.target, s.slot, weight * g, m_items, valid);
+                }
+                s.slot += dr::select(valid, UInt32D(1), UInt32D(0));
             },
             "Direct light: candidates");
         return std::move(state.kept);

@@ -4,14 +4,17 @@
  * Lights of the scenes that an integrator has met: built when a scene is first rendered,
  * and again when its emitters or their shapes have changed.
  *
- * Mitsuba has no hook before rendering. `render()` therefore calls \ref update, which
- * compares a fingerprint of the emitters; `sample()`, which other integrators may call on
- * their own, calls \ref get, which only compares the scene.
+ * Mitsuba has no hook before rendering. `render()` holds a \ref Rendering, which compares a
+ * fingerprint of the emitters once. Other integrators (`moment`, `stokes`) call `sample()`
+ * alone: then the fingerprint is taken there, once for each recording in JIT variants, and in
+ * scalar ones whenever a thread comes with another sampler, which it does for each of its
+ * parts of an image.
  */
 
 #include "scene_lights.h"
 #include <atomic>
 #include <mitsuba/core/logger.h>
+#include <mitsuba/render/sampler.h>
 #include <mutex>
 #include <sstream>
 
@@ -19,33 +22,40 @@ namespace manylights {
 
 template <typename Float, typename Spectrum> class LightCache {
 public:
-    using Lights = SceneLights<Float, Spectrum>;
-    using Scene  = mitsuba::Scene<Float, Spectrum>;
+    using Lights  = SceneLights<Float, Spectrum>;
+    using Scene   = mitsuba::Scene<Float, Spectrum>;
+    using Sampler = mitsuba::Sampler<Float, Spectrum>;
 
     explicit LightCache(bool keep_binary) : m_keep_binary(keep_binary) {}
 
-    /// Make the lights of a scene current, and build them if they are new or changed
-    const Lights &update(const Scene *scene) {
-        refuse_freezing();
-        std::lock_guard<std::mutex> guard(m_mutex);
-        Fingerprint<Float> fingerprint = Lights::fingerprint(scene);
-        for (const auto &entry : m_entries)
-            if (entry && entry->scene == scene && entry->fingerprint == fingerprint)
-                return select(entry.get());
-        return select(build(scene, std::move(fingerprint)));
-    }
+    /// Brings the lights of a scene up to date and vouches for them while it lives
+    class Rendering {
+    public:
+        Rendering(const LightCache &cache, const Scene *scene) : m_cache(cache) {
+            cache.update(scene);
+            cache.m_rendering = scene;
+        }
+        ~Rendering() { m_cache.m_rendering = nullptr; }
+        Rendering(const Rendering &) = delete;
 
-    /// The lights of a scene; cheap enough for every ray of a scalar variant
-    const Lights &get(const Scene *scene) const {
+    private:
+        const LightCache &m_cache;
+    };
+
+    /// The lights of a scene, for `sample()`; cheap enough for every ray
+    const Lights &get(const Scene *scene, const Sampler *sampler) const {
         const Entry *current = m_current.load(std::memory_order_acquire);
-        if (current && current->scene == scene)
+        if (current && current->scene == scene && m_rendering == scene)
             return *current->lights;
-        std::lock_guard<std::mutex> guard(m_mutex);
-        for (const auto &entry : m_entries)
-            if (entry && entry->scene == scene)
-                return select(entry.get());
-        refuse_freezing();
-        return select(build(scene, Lights::fingerprint(scene)));
+        if constexpr (dr::is_jit_v<Float>) {
+            (void) sampler;
+            return update(scene);
+        } else {
+            thread_local Visit last;
+            if (!last.is(this, scene, sampler))
+                last.set(this, scene, sampler, update(scene));
+            return *last.lights;
+        }
     }
 
     /// Expose the size of the current tree, read-only
@@ -69,11 +79,47 @@ public:
 private:
     using Statistics = typename Lights::Statistics;
 
+    /// What a thread saw last. It keeps the sampler and the lights, so that no other can get
+    /// their addresses; the references left at the end of a thread are not given back, since
+    /// the thread may outlive this library.
+    struct Visit {
+        const LightCache *cache = nullptr;
+        const Scene *scene      = nullptr;
+        const Sampler *sampler  = nullptr;
+        const Lights *lights    = nullptr;
+
+        bool is(const LightCache *c, const Scene *sc, const Sampler *sa) const {
+            return cache == c && scene == sc && sampler == sa;
+        }
+
+        void set(const LightCache *c, const Scene *sc, const Sampler *sa,
+                 const Lights &l) {
+            sa->inc_ref();
+            l.inc_ref();
+            if (sampler)
+                sampler->dec_ref();
+            if (lights)
+                lights->dec_ref();
+            *this = { c, sc, sa, &l };
+        }
+    };
+
     struct Entry {
         const Scene *scene;
         Fingerprint<Float> fingerprint;
         mitsuba::ref<Lights> lights;
     };
+
+    /// Make the lights of a scene current, and build them if they are new or changed
+    const Lights &update(const Scene *scene) const {
+        refuse_freezing();
+        std::lock_guard<std::mutex> guard(m_mutex);
+        Fingerprint<Float> fingerprint = Lights::fingerprint(scene);
+        for (const auto &entry : m_entries)
+            if (entry && entry->scene == scene && entry->fingerprint == fingerprint)
+                return select(entry.get());
+        return select(build(scene, std::move(fingerprint)));
+    }
 
     /// Takes the place of this scene's old lights, or of the scene that was built before last
     Entry *build(const Scene *scene, Fingerprint<Float> &&fingerprint) const {
@@ -116,6 +162,8 @@ private:
     mutable std::mutex m_mutex;
     mutable std::unique_ptr<Entry> m_entries[2];
     mutable std::atomic<Entry *> m_current{ nullptr };
+    /// The scene whose lights `render()` has just checked
+    mutable std::atomic<const Scene *> m_rendering{ nullptr };
     Statistics m_statistics;
 
     static constexpr const char *ClassName = "LightCache"; // for log messages

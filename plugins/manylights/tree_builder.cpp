@@ -277,8 +277,7 @@ private:
             for (uint32_t i = 0; i < count; ++i) {
                 const Node &node = m_nodes[children[i]];
                 if (node.light == kNone &&
-                    (worst < 0 ||
-                     node.cluster.cost > m_nodes[children[worst]].cluster.cost))
+                    (worst < 0 || costlier(node, m_nodes[children[worst]])))
                     worst = (int) i;
             }
             if (worst < 0)
@@ -292,6 +291,12 @@ private:
             ++count;
         }
         return count;
+    }
+
+    /// By cost; coincident lights cost nothing and are opened by flux
+    static bool costlier(const Node &a, const Node &b) {
+        return a.cluster.cost != b.cluster.cost ? a.cluster.cost > b.cluster.cost
+                                                : a.cluster.flux > b.cluster.flux;
     }
 
     static void write_child(WideNode &node, uint32_t slot, const Cluster &cluster) {
