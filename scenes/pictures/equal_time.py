@@ -17,7 +17,7 @@ import manylights
 
 mi.set_variant("llvm_ad_rgb")
 FOLDER = Path(__file__).parent
-SIZE = {"width": 640, "height": 360}
+SIZE = {"width": 480, "height": 270}
 LIGHTS = 20_000
 SAMPLES = 16
 
@@ -57,7 +57,7 @@ def main() -> None:
     scene = mi.load_dict(manylights.scenes.city(LIGHTS, kind="mesh", texture=True, **SIZE))
     ours = mi.load_dict({"type": "manylights_direct"})
     theirs = mi.load_dict({"type": "direct"})
-    reference = np.mean([render(scene, ours, 256, 100 + i) for i in range(8)], axis=0)
+    reference = np.mean([render(scene, ours, 128, 100 + i) for i in range(4)], axis=0)
 
     seconds = render_time(scene, ours, SAMPLES)
     # Mitsuba's time is proportional to the samples: find the number that takes as long
