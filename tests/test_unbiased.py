@@ -139,9 +139,10 @@ def test_mean_equals_exhaustive_uniform_and_power_sampling(llvm, name):
 
 def scalar_scenes():
     """All scenes; those that take long are marked."""
-    for name in light_scenes.SCENES:
-        marks = [pytest.mark.slow] if name in SLOW_SCENES else []
-        yield pytest.param(name, marks=marks)
+    return [
+        pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_SCENES else [])
+        for name in light_scenes.SCENES
+    ]
 
 
 @pytest.mark.parametrize("name", scalar_scenes())
