@@ -155,7 +155,7 @@ public:
         if (m_hide_emitters)
             skip_emitters(scene, ray, si, active);
         else
-            result = direct.emitted(si, active).first;
+            result = direct.emission().emitted(si, active).first;
 
         active &= si.is_valid();
         Mask valid_ray = active;

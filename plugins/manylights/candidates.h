@@ -200,8 +200,8 @@ template <typename Float> struct StochasticCursor {
             Mask cut;
             DRJIT_STRUCT(Descent, node, resume, x, probability, cut)
         };
-        Descent d{ node,       UInt32(0),   rng.template next_float<Float>(),
-                   Float(1.f), Mask(false) };
+        Descent d{ node, UInt32(0), rng.template next_float<Float>(), Float(1.f),
+                   Mask(false) };
         d.resume = node;
         loop(
             d, [](const Descent &s) { return (s.node & kLeafBit) == 0u; },

@@ -21,7 +21,8 @@
  */
 
 #include "parameters.h"
-#include "scene_lights.h"
+#include "receiver.h"
+#include "scene_emission.h"
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/integrator.h>
 #include <mitsuba/render/sampler.h>
@@ -50,10 +51,11 @@ public:
     using MaskD    = typename Lights::MaskD;
     using Point2fD = mitsuba::Point<FloatD, 2>;
     using Rng      = dr::PCG32<UInt32D>;
+    using Reader   = ReceiverReader<Float, Spectrum>;
 
     DirectLight(const Scene *scene, const Lights &lights,
                 const SamplingParameters &params)
-        : m_scene(scene), m_lights(lights), m_params(params) {
+        : m_scene(scene), m_lights(lights), m_emission(scene, lights), m_params(params) {
         uint32_t count = lights.tree().light_count;
         // N <= m: no tree, every light is a candidate
         m_all      = count <= params.reservoirs || params.visits_all();
@@ -63,6 +65,8 @@ public:
         m_items    = m_slots + (uint32_t) lights.infinite().size();
         m_choose   = m_items > params.shadow_rays;
     }
+
+    const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
 
     /// Can BSDF sampling find light at all?
     bool needs_bsdf_samples() const {
@@ -80,7 +84,8 @@ public:
 
     Shading prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
                     const LightSample<Float> &u, Mask active) const {
-        return { si, bsdf, u, receiver(si, bsdf, active) };
+        bool glossy = m_lights.tree().glossy && !m_all;
+        return { si, bsdf, u, Reader::read(si, bsdf, glossy, active) };
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
@@ -103,7 +108,7 @@ public:
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
             SurfaceInteraction3f hit =
                 m_scene->ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active_b);
-            auto [radiance, light] = emitted(hit, active_b);
+            auto [radiance, light] = m_emission.emitted(hit, active_b);
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
             Float light_pdf = dr::select(
@@ -113,37 +118,6 @@ public:
                                 (float) m_params.bsdf_samples;
         }
         return result;
-    }
-
-    /**
-     * Radiance emitted from a surface (or the environment, without a hit) against the ray
-     * that found it, and the surface's light in the table.
-     */
-    std::pair<Spectrum, UInt32D> emitted(const SurfaceInteraction3f &si,
-                                         Mask active) const {
-        Spectrum result(0.f);
-        UInt32D light(kNone);
-        Mask valid = active && si.is_valid();
-        if (m_lights.can_be_hit()) {
-            light         = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
-            Mask in_table = light < kOnlyHit, by_plugin = light == kOnlyHit;
-            if (dr::any_or<true>(in_table)) {
-                Row<FloatD> row = m_lights.tree().row(light, plain(in_table));
-                Mask tabulated  = in_table && row.tabulated();
-                Mask front      = Frame3f::cos_theta(si.wi) > 0.f;
-                by_plugin |= in_table && !tabulated;
-                if (dr::any_or<true>(tabulated))
-                    result = mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) &
-                                                            (tabulated && front));
-            }
-            if (m_lights.needs_emitter_eval())
-                add_masked(result, by_plugin,
-                           [&](Mask m) { return si.shape->emitter()->eval(si, m); });
-        }
-        if (const Emitter *environment = m_scene->environment())
-            add_masked(result, active && !si.is_valid(),
-                       [&](Mask m) { return environment->eval(si, m); });
-        return { result, light };
     }
 
 private:
@@ -169,47 +143,6 @@ private:
     };
 
     // --------------------------------------------------------------- Stages 1 and 2
-
-    Receiver<FloatD> receiver(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                              Mask active) const {
-        Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
-        Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
-        Receiver<FloatD> at{ plain(si.p),      plain(n),    plain(si.to_world(si.wi)),
-                             plain(transmits), FloatD(1.f), FloatD(0.f),
-                             FloatD(1.f) };
-        if (m_lights.tree().glossy && !m_all)
-            measure_lobe(si, bsdf, at, active);
-        return at;
-    }
-
-    /**
-     * The glossy lobe, for any BSDF: its value and density in the mirror direction, and its
-     * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.
-     * Only h and H see this, so it does not have to be right.
-     */
-    void measure_lobe(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                      Receiver<FloatD> &at, Mask active) const {
-        dr::suspend_grad<Float> detached;
-        mitsuba::BSDFContext ctx;
-        Float cos_i = Frame3f::cos_theta(si.wi);
-        Vector3f mirror(-si.wi.x(), -si.wi.y(), si.wi.z());
-        // At 60 degrees from the normal and at a right angle to the plane of incidence
-        Float inv =
-            .866f * dr::rsqrt(dr::square(si.wi.x()) + dr::square(si.wi.y()) + 1e-12f);
-        Vector3f aside(-si.wi.y() * inv, si.wi.x() * inv, dr::mulsign(Float(.5f), cos_i));
-
-        auto [peak, density] = bsdf->eval_pdf(ctx, si, mirror, active);
-        Spectrum base        = bsdf->eval(ctx, si, aside, active);
-        FloatD cosine        = dr::maximum(dr::abs(plain(cos_i)), 1e-3f);
-        FloatD off = target(base) * 2.f, on = target(peak) / cosine;
-        FloatD alpha2 =
-            dr::rcp(4.f * dr::Pi<FloatD> * cosine *
-                    dr::maximum(plain(density) - cosine * dr::InvPi<FloatD>, .05f));
-        at.alpha2   = dr::clip(alpha2, 1e-5f, 1.f);
-        at.specular = dr::maximum(on - off, 0.f) * at.alpha2;
-        // The share that the lobe never takes away
-        at.diffuse = off + .01f * on + 1e-6f;
-    }
 
     /// Choices are not differentiated: no gradient passes through here
     Kept keep_lights(const Shading &shading, Mask active) const {
@@ -361,7 +294,7 @@ private:
         FloatD tau(0.f);
         if (m_choose) {
             for (size_t i = 0; i < infinite.size(); ++i)
-                kept.target[m_slots + i] = target(infinite[i].value);
+                kept.target[m_slots + i] = Reader::target(infinite[i].value);
             tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays);
         }
 
@@ -420,21 +353,9 @@ private:
     /// luminance(F) of a light's point
     FloatD light_target(const Shading &shading, const UInt32D &light,
                         const FloatD &inclusion, const UInt32D &slot, Mask active) const {
-        return target(sample_light_point(shading, light, inclusion, slot,
-                                         /* target_only = */ true, active)
-                          .value);
-    }
-
-    /// Positive wherever the value is not zero; invalid values are never chosen
-    static FloatD target(const Spectrum &value) {
-        UnpolarizedSpectrum v = mitsuba::unpolarized_spectrum(value);
-        Float result;
-        if constexpr (mitsuba::is_rgb_v<Spectrum>)
-            result = mitsuba::luminance(v);
-        else
-            result = dr::mean(v);
-        FloatD g = plain(result);
-        return dr::select(g > 0.f && dr::isfinite(g), g, 0.f);
+        return Reader::target(sample_light_point(shading, light, inclusion, slot,
+                                                 /* target_only = */ true, active)
+                                  .value);
     }
 
     /**
@@ -466,8 +387,8 @@ private:
                 dr::masked(result.value, other) =
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
             } else if (dr::any_or<true>(other)) {
-                Sample sample =
-                    sample_emitter(shading, emitter_of(row), u, Float(inclusion), other);
+                Sample sample = sample_emitter(shading, m_emission.emitter_of(row), u,
+                                               Float(inclusion), other);
                 dr::masked(result, other) = sample;
             }
         }
@@ -494,16 +415,16 @@ private:
 
         const SurfaceInteraction3f &si = shading.si;
         Vector3f d                     = dr::normalize(Point3f(point.p) - si.p);
-        Spectrum emission = mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) &
-                                                           Mask(row.tabulated()));
+        Spectrum emission              = mitsuba::depolarizer<Spectrum>(
+            m_emission.color(row, si.wavelengths) & Mask(row.tabulated()));
         if (m_lights.needs_emitter_eval()) {
             Mask eval = active && !row.tabulated();
             if (target_only)
                 dr::masked(emission, eval) = mitsuba::depolarizer<Spectrum>(
                     UnpolarizedSpectrum(Float(row[kLuminance])));
             else
-                add_masked(emission, eval, [&](Mask m) {
-                    return triangle_emission(si, row, point, d, m);
+                m_emission.add_masked(emission, eval, [&](Mask m) {
+                    return m_emission.triangle_emission(si, row, point, d, m);
                 });
         }
         bool delta_only = !m_lights.can_be_hit();
@@ -552,58 +473,6 @@ private:
         return samples;
     }
 
-    // ------------------------------------------------------------------------ Emission
-
-    EmitterPtr emitter_of(const Row<FloatD> &row) const {
-        using UInt32 = dr::uint32_array_t<Float>;
-        return dr::gather<EmitterPtr>(m_scene->emitters_dr(), UInt32(row.emitter()),
-                                      Mask(true));
-    }
-
-    /// Add f(mask) where the mask is set; scalar variants do not call f otherwise
-    template <typename F>
-    static void add_masked(Spectrum &result, Mask mask, const F &f) {
-        if (dr::any_or<true>(mask))
-            dr::masked(result, mask) = result + f(mask);
-    }
-
-    /// Radiance or intensity of a tabulated row
-    static UnpolarizedSpectrum color(const Row<FloatD> &row,
-                                     const Wavelength &wavelengths) {
-        if constexpr (mitsuba::is_spectral_v<Spectrum>) {
-            dr::Array<Float, 3> coefficients(row[kColor], row[kColor + 1],
-                                             row[kColor + 2]);
-            return Float(row[kScale]) *
-                   mitsuba::cie_d65<UnpolarizedSpectrum>(wavelengths) *
-                   mitsuba::srgb_model_eval<UnpolarizedSpectrum>(coefficients,
-                                                                 wavelengths);
-        } else {
-            UnpolarizedSpectrum result;
-            for (size_t i = 0; i < result.size(); ++i)
-                result.entry(i) = row[kColor + i];
-            return result;
-        }
-    }
-
-    /// Radiance of a triangle whose emission varies, from its emitter
-    Spectrum triangle_emission(const SurfaceInteraction3f &from, const Row<FloatD> &row,
-                               const LightPoint<FloatD> &point, const Vector3f &d,
-                               Mask active) const {
-        EmitterPtr emitter           = emitter_of(row);
-        PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        MaskD flipped                = row[kColor + 1] > 0.f;
-        pi.valid                     = active;
-        pi.t                         = dr::norm(Point3f(point.p) - from.p);
-        pi.prim_uv    = Point2f(dr::select(flipped, point.uv.y(), point.uv.x()),
-                                dr::select(flipped, point.uv.x(), point.uv.y()));
-        pi.prim_index = row.bits(kColor);
-        pi.shape      = emitter->shape();
-        Ray3f ray(from.p, d, from.time, from.wavelengths);
-        SurfaceInteraction3f si =
-            pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, active);
-        return emitter->eval(si, active);
-    }
-
     // ------------------------------------------------------------------------- Density
 
     /// Density of the light side for the direction that hit `light` or the environment
@@ -627,7 +496,7 @@ private:
                 if (dr::any_or<true>(other)) {
                     DirectionSample3f ds(m_scene, hit, si);
                     dr::masked(result, other) =
-                        emitter_of(row)->pdf_direction(si, ds, other);
+                        m_emission.emitter_of(row)->pdf_direction(si, ds, other);
                 }
             }
             result *= Float(
@@ -657,6 +526,7 @@ private:
 
     const Scene *m_scene;
     const Lights &m_lights;
+    SceneEmission<Float, Spectrum> m_emission;
     const SamplingParameters &m_params;
     /// Is every light a candidate? Is every candidate kept? Are there more than shadow rays?
     bool m_all, m_keep_all, m_choose;

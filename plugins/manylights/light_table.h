@@ -14,63 +14,14 @@
  * of its plugins have no headers.
  */
 
-#include "light.h"
-#include <cmath>
+#include "mesh_emission.h"
 #include <cstring>
-#include <map>
 #include <mitsuba/core/qmc.h>
-#include <mitsuba/core/spectrum.h>
-#include <mitsuba/render/emitter.h>
-#include <mitsuba/render/mesh.h>
 #include <mitsuba/render/scene.h>
-#include <mitsuba/render/srgb.h>
-#include <mitsuba/render/texture.h>
 
 namespace manylights {
 
 namespace dr = drjit;
-
-/// The parameters of an object by name, children included ("intensity.value")
-class ParameterReader : public mitsuba::TraversalCallback {
-public:
-    explicit ParameterReader(const mitsuba::Object *object) {
-        const_cast<mitsuba::Object *>(object)->traverse(this);
-    }
-
-    /// The parameter as a `T`, or null if it is absent or of another type
-    template <typename T> const T *find(const std::string &name) const {
-        auto it = m_values.find(name);
-        return it != m_values.end() && *it->second.second == typeid(T)
-                   ? (const T *) it->second.first
-                   : nullptr;
-    }
-
-    const mitsuba::Object *object(const std::string &name) const {
-        auto it = m_objects.find(name);
-        return it != m_objects.end() ? it->second : nullptr;
-    }
-
-protected:
-    void put_value(std::string_view name, void *value, uint32_t,
-                   const std::type_info &type) override {
-        m_values[m_prefix + std::string(name)] = { value, &type };
-    }
-
-    void put_object(std::string_view name, mitsuba::Object *value, uint32_t) override {
-        if (!value)
-            return;
-        std::string prefix                    = m_prefix;
-        m_objects[prefix + std::string(name)] = value;
-        m_prefix += std::string(name) + ".";
-        value->traverse(this);
-        m_prefix = prefix;
-    }
-
-private:
-    std::string m_prefix;
-    std::map<std::string, std::pair<void *, const std::type_info *>> m_values;
-    std::map<std::string, mitsuba::Object *> m_objects;
-};
 
 /// Primitives of one emissive shape -> lights: light_of_primitive[first + primitive]
 template <typename Shape> struct ShapeLights {
@@ -98,7 +49,7 @@ template <typename Float, typename Spectrum> struct HostTable {
 
 template <typename Float, typename Spectrum> class LightTableReader {
 public:
-    MI_IMPORT_TYPES(Scene, Emitter, Shape, Mesh, Texture)
+    MI_IMPORT_TYPES(Scene, Emitter, Shape, Mesh)
     using Table = HostTable<Float, Spectrum>;
 
     /// Read all emitters of a scene
@@ -112,14 +63,6 @@ public:
     }
 
 private:
-    /// Emission that does not vary over the emitter
-    struct Emission {
-        float color[3] = {};
-        float scale = 1.f, luminance = 0.f;
-        /// Can a row hold it? If not, only `luminance` is valid
-        bool tabulated = false;
-    };
-
     void add(const Emitter *emitter, uint32_t index) {
         m_emitter    = index;
         bool surface = has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface);
@@ -144,101 +87,12 @@ private:
             add_other(emitter);
     }
 
-    // ---------------------------------------------------------------- Reading values
-
-    static float slice(const Float &value) { return (float) dr::slice(value, 0); }
-
-    template <typename T> static void copy3(const T &value, float out[3]) {
-        for (size_t i = 0; i < 3; ++i)
-            out[i] = slice(value.entry(i));
-    }
-
-    /// Constant emission from the texture that is the parameter `name` of `emitter`
-    static Emission read_emission(const ParameterReader &params,
-                                  const std::string &name) {
-        Emission e;
-        const mitsuba::Object *texture = params.object(name);
-        std::string_view type = texture ? texture->class_name() : std::string_view();
-        using Color =
-            mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
-        const Color *color = params.find<Color>(name + ".value");
-        if constexpr (mitsuba::is_spectral_v<Spectrum>) {
-            using Values = mitsuba::DynamicBuffer<Float>;
-            bool regular = type == "RegularSpectrum";
-            const Values *d65 =
-                params.find<Values>(name + (regular ? ".values" : ".d65.values"));
-            bool has_color = type == "D65Spectrum" && color;
-            if (d65 && (has_color || (regular && is_d65(*d65)))) {
-                e.scale    = scale_of_d65(*d65);
-                e.color[2] = std::numeric_limits<float>::infinity(); // sigmoid of 1
-                if (has_color)
-                    copy3(*color, e.color);
-                e.luminance = spectral_mean(e);
-                e.tabulated = true;
-            }
-        } else {
-            if (type == "SRGBReflectanceSpectrum" && color) {
-                for (size_t i = 0; i < color->size(); ++i)
-                    e.color[i] = slice(color->entry(i));
-                e.tabulated = true;
-            } else if (const Float *value = params.find<Float>(name + ".value");
-                       type == "UniformSpectrum" && value) {
-                std::fill_n(e.color, 3, slice(*value));
-                e.tabulated = true;
-            }
-            e.luminance = luminance(e.color);
-        }
-        return e;
-    }
-
-    static float luminance(const float color[3]) {
-        if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
-            return color[0];
-        else
-            return mitsuba::luminance(
-                mitsuba::Color<float, 3>(color[0], color[1], color[2]));
-    }
-
-    static float d65_value(size_t i) {
-        return (float) (mitsuba::d65_table[i] * MI_CIE_D65_NORMALIZATION);
-    }
-
-    template <typename Values> static float scale_of_d65(const Values &values) {
-        return (float) dr::slice(values, 0) / d65_value(0);
-    }
-
-    template <typename Values> static bool is_d65(const Values &values) {
-        if (dr::width(values) != MI_CIE_SAMPLES)
-            return false;
-        float scale = scale_of_d65(values);
-        for (size_t i = 1; i < MI_CIE_SAMPLES; ++i) {
-            float expected = scale * d65_value(i);
-            if (std::abs((float) dr::slice(values, i) - expected) > 1e-5f * expected)
-                return false;
-        }
-        return true;
-    }
-
-    /// Mean of scale * D65 * S over the visible range (the stage-3 target's luminance)
-    static float spectral_mean(const Emission &e) {
-        double sum = 0;
-        for (size_t i = 0; i < MI_CIE_SAMPLES; ++i) {
-            double w =
-                MI_CIE_MIN + (MI_CIE_MAX - MI_CIE_MIN) * i / (MI_CIE_SAMPLES - 1.0);
-            double v = (e.color[0] * w + e.color[1]) * w + e.color[2],
-                   s = std::isinf(v) ? (v > 0 ? 1 : 0)
-                                     : .5 + .5 * v / std::sqrt(1 + v * v);
-            sum += d65_value(i) * s;
-        }
-        return (float) (e.scale * sum / MI_CIE_SAMPLES);
-    }
-
     // ------------------------------------------------------------- Points and spots
 
     void add_point(const Emitter *emitter) {
         ParameterReader params(emitter);
-        Emission e              = read_emission(params, "intensity");
-        using Point3f           = mitsuba::Point<Float, 3>;
+        Emission e    = EmissionReader<Float, Spectrum>::read(params, "intensity");
+        using Point3f = mitsuba::Point<Float, 3>;
         const Point3f *position = params.find<Point3f>("position");
         if (!position || !e.tabulated)
             return add_other(emitter);
@@ -251,7 +105,7 @@ private:
 
     void add_spot(const Emitter *emitter) {
         ParameterReader params(emitter);
-        Emission e              = read_emission(params, "intensity");
+        Emission e = EmissionReader<Float, Spectrum>::read(params, "intensity");
         const Float *cutoff_deg = params.find<Float>("cutoff_angle"),
                     *beam_deg   = params.find<Float>("beam_width");
         float matrix[3][4];
@@ -261,8 +115,8 @@ private:
             !read_similarity(emitter->world_transform(), matrix))
             return add_other(emitter);
 
-        float cutoff = dr::deg_to_rad(slice(*cutoff_deg)),
-              beam   = dr::deg_to_rad(slice(*beam_deg));
+        float cutoff = dr::deg_to_rad(read_scalar(*cutoff_deg)),
+              beam   = dr::deg_to_rad(read_scalar(*beam_deg));
         LightRow row = make_row(LightKind::Spot, e);
         float length = std::hypot(matrix[0][2], matrix[1][2], matrix[2][2]);
         for (int i = 0; i < 3; ++i) {
@@ -286,7 +140,7 @@ private:
     static bool read_similarity(const Transform &transform, float matrix[3][4]) {
         for (size_t i = 0; i < 3; ++i)
             for (size_t j = 0; j < 4; ++j)
-                matrix[i][j] = slice(transform.matrix.entry(i, j));
+                matrix[i][j] = read_scalar(transform.matrix.entry(i, j));
         float dots[6], scale = 0;
         const int pairs[6][2] = { { 0, 0 }, { 1, 1 }, { 2, 2 },
                                   { 0, 1 }, { 0, 2 }, { 1, 2 } };
@@ -306,7 +160,7 @@ private:
 
     void add_area(const Emitter *emitter, const Shape *shape) {
         ParameterReader params(emitter);
-        Emission e     = read_emission(params, "radiance");
+        Emission e     = EmissionReader<Float, Spectrum>::read(params, "radiance");
         uint32_t first = (uint32_t) m_table.light_of_primitive.size();
         if (shape->is_mesh()) {
             add_mesh(emitter, (const Mesh *) shape, e, params.object("radiance"));
@@ -340,7 +194,7 @@ private:
                                      "\" does not expose its \"to_world\"");
         for (size_t i = 0; i < 3; ++i)
             for (size_t j = 0; j < 4; ++j)
-                m[i][j] = slice(to_world->matrix.entry(i, j));
+                m[i][j] = read_scalar(to_world->matrix.entry(i, j));
     }
 
     static float column_length(const float m[3][4], int j) {
@@ -421,27 +275,20 @@ private:
         std::vector<float> vertices = download<float>(mesh->vertex_positions_buffer());
         std::vector<uint32_t> faces = download<uint32_t>(mesh->faces_buffer());
         size_t count                = faces.size() / 3;
-        /* With smooth normals the emitting side depends on the point: let the plugin decide
-           (it compares with the shading normal). */
-        std::vector<Emission> emission;
-        if (!constant.tabulated || mesh->has_vertex_normals())
-            emission = face_emission(emitter, mesh, constant, texture, count);
+        std::vector<Emission> emission(count, constant);
+        if (!constant.tabulated)
+            emission = MeshEmission<Float, Spectrum>(emitter, mesh).read(texture);
 
         for (size_t f = 0; f < count; ++f) {
-            uint32_t light    = (uint32_t) m_table.rows.size();
-            const Emission &e = emission.empty() ? constant : emission[f];
+            uint32_t light = (uint32_t) m_table.rows.size();
+            Emission e     = emission[f];
+            // With smooth normals the emitting side depends on the point: ask the emitter,
+            // which compares with the shading normal
+            e.tabulated &= !mesh->has_vertex_normals();
             add_triangle(vertices, &faces[3 * f], e, (uint32_t) f,
                          mesh->has_flipped_normals());
             push_primitive(light);
         }
-    }
-
-    template <typename T, typename Buffer>
-    static std::vector<T> download(const Buffer &buffer) {
-        auto host = dr::migrate(buffer, JitBackend::None);
-        if constexpr (dr::is_jit_v<Float>)
-            dr::sync_thread();
-        return std::vector<T>(host.data(), host.data() + dr::width(buffer));
     }
 
     void add_triangle(const std::vector<float> &vertices, const uint32_t *face,
@@ -472,166 +319,6 @@ private:
             row.color[1] = flip ? 1.f : 0.f;
         }
         add_light(row, bounds);
-    }
-
-    /// Mean emission of each face of a mesh
-    std::vector<Emission> face_emission(const Emitter *emitter, const Mesh *mesh,
-                                        const Emission &constant,
-                                        const mitsuba::Object *texture, size_t count) {
-        bool attribute = texture && texture->class_name() == "MeshAttribute";
-        std::vector<Emission> result(count);
-        if (constant.tabulated) {
-            for (Emission &e : result)
-                e.luminance = constant.luminance;
-        } else if (attribute) {
-            // Linear over a face: its mean is that of the corners, if it varies at all
-            read_attribute(emitter, mesh, result);
-        } else {
-            integrate_texture(emitter, mesh, texture, result);
-        }
-        return result;
-    }
-
-    /// Colour at one point of every face
-    using Color3 = std::array<float, 3>;
-    std::vector<Color3> evaluate(const Emitter *emitter, const Mesh *mesh,
-                                 const std::vector<uint32_t> &faces,
-                                 const std::vector<float> &b1,
-                                 const std::vector<float> &b2) const {
-        MI_IMPORT_CORE_TYPES()
-        size_t count = faces.size();
-        std::vector<Color3> result(count);
-        if constexpr (dr::is_jit_v<Float>) {
-            Color3fOf<Float> color = evaluate_color(
-                emitter, mesh, dr::load<UInt32>(faces.data(), count),
-                dr::load<Float>(b1.data(), count), dr::load<Float>(b2.data(), count));
-            for (int c = 0; c < 3; ++c) {
-                color.entry(c) += dr::zeros<Float>(count);
-                std::vector<float> host = download<float>(dr::detach(color.entry(c)));
-                for (size_t i = 0; i < count; ++i)
-                    result[i][c] = host[i];
-            }
-        } else {
-            for (size_t i = 0; i < count; ++i) {
-                auto color = evaluate_color(emitter, mesh, faces[i], b1[i], b2[i]);
-                result[i]  = { color[0], color[1], color[2] };
-            }
-        }
-        return result;
-    }
-
-    template <typename F> using Color3fOf = mitsuba::Color<F, 3>;
-
-    /// Emitted colour along the normal; three copies of the mean of a spectrum
-    Color3fOf<Float> evaluate_color(const Emitter *emitter, const Mesh *mesh,
-                                    const dr::uint32_array_t<Float> &face,
-                                    const Float &b1, const Float &b2) const {
-        PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        pi.t                         = 1.f;
-        pi.prim_uv                   = { b1, b2 };
-        pi.prim_index                = face;
-        pi.shape                     = mesh;
-        Ray3f ray                    = dr::zeros<Ray3f>();
-        SurfaceInteraction3f si =
-            mesh->compute_surface_interaction(ray, pi, +mitsuba::RayFlags::All, 0, true);
-        si.shape      = mesh;
-        si.prim_index = face;
-        si.wi         = { 0.f, 0.f, 1.f };
-        if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            si.wavelengths = { 450.f, 520.f, 590.f, 650.f };
-        auto value = mitsuba::unpolarized_spectrum(emitter->eval(si, true));
-        if constexpr (mitsuba::is_rgb_v<Spectrum>)
-            return value;
-        else
-            return Color3fOf<Float>(dr::mean(value));
-    }
-
-    void read_attribute(const Emitter *emitter, const Mesh *mesh,
-                        std::vector<Emission> &result) const {
-        size_t count = result.size();
-        std::vector<uint32_t> faces(count);
-        for (size_t i = 0; i < count; ++i)
-            faces[i] = (uint32_t) i;
-        std::vector<Color3> corner[3];
-        for (int c = 0; c < 3; ++c) // just inside of the corners
-            corner[c] = evaluate(emitter, mesh, faces,
-                                 std::vector<float>(count, c == 1 ? .9f : .05f),
-                                 std::vector<float>(count, c == 2 ? .9f : .05f));
-        for (size_t i = 0; i < count; ++i) {
-            Emission &e   = result[i];
-            bool constant = corner[0][i] == corner[1][i] && corner[0][i] == corner[2][i];
-            for (int c = 0; c < 3; ++c)
-                e.color[c] =
-                    constant ? corner[0][i][c]
-                             : (corner[0][i][c] + corner[1][i][c] + corner[2][i][c]) / 3;
-            e.luminance = luminance(e.color);
-            // A spectrum cannot be recovered from its mean
-            e.tabulated = constant && !mitsuba::is_spectral_v<Spectrum> &&
-                          !mesh->has_vertex_normals();
-        }
-    }
-
-    /// Sub-triangles along each edge of a face: about two for each texel along it
-    static uint32_t subdivisions(const Mesh *mesh, const std::vector<float> &uv,
-                                 const uint32_t *face, ScalarVector2i resolution) {
-        if (!mesh->has_vertex_texcoords())
-            return 2;
-        float longest = 0;
-        for (int i = 0; i < 3; ++i) {
-            const float *a = &uv[2 * face[i]], *b = &uv[2 * face[(i + 1) % 3]];
-            longest = std::max({ longest, std::abs(a[0] - b[0]) * resolution.x(),
-                                 std::abs(a[1] - b[1]) * resolution.y() });
-        }
-        return (uint32_t) std::clamp(std::ceil(2 * longest), 2.f, 2048.f);
-    }
-
-    void integrate_texture(const Emitter *emitter, const Mesh *mesh,
-                           const mitsuba::Object *texture,
-                           std::vector<Emission> &result) const {
-        std::vector<uint32_t> indices = download<uint32_t>(mesh->faces_buffer());
-        std::vector<float> uv         = download<float>(mesh->vertex_texcoords_buffer());
-        ScalarVector2i resolution(64, 64); // of procedural textures
-        if (auto *t = dynamic_cast<const Texture *>(texture); t && has_resolution(t))
-            resolution = t->resolution();
-
-        // Quadrature points in batches: centroids of n^2 equal sub-triangles
-        std::vector<uint32_t> faces;
-        std::vector<float> b1, b2;
-        constexpr size_t batch = 1 << 22;
-        std::vector<double> sum(result.size(), 0.0), points(result.size(), 0.0);
-        auto flush = [&] {
-            std::vector<Color3> colors = evaluate(emitter, mesh, faces, b1, b2);
-            for (size_t i = 0; i < faces.size(); ++i) {
-                sum[faces[i]] += luminance(colors[i].data());
-                points[faces[i]] += 1;
-            }
-            faces.clear();
-            b1.clear();
-            b2.clear();
-        };
-        for (uint32_t f = 0; f < result.size(); ++f) {
-            uint32_t n = subdivisions(mesh, uv, &indices[3 * f], resolution);
-            for (uint32_t i = 0; i < n; ++i)
-                for (uint32_t j = 0; i + j < n; ++j)
-                    for (uint32_t upper = 0; upper < 2 && i + j + upper < n; ++upper) {
-                        faces.push_back(f);
-                        b1.push_back((i + (1.f + upper) / 3.f) / n);
-                        b2.push_back((j + (1.f + upper) / 3.f) / n);
-                    }
-            if (faces.size() >= batch)
-                flush();
-        }
-        flush();
-        for (size_t f = 0; f < result.size(); ++f)
-            result[f].luminance = (float) (sum[f] / points[f]);
-    }
-
-    static bool has_resolution(const Texture *texture) {
-        try {
-            return dr::all(texture->resolution() > 0);
-        } catch (const std::exception &) {
-            return false; // procedural: not implemented
-        }
     }
 
     // --------------------------------------------------------------- Anything else
@@ -704,7 +391,7 @@ private:
         if (has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaPosition)) {
             auto position = emitter->world_transform().translation();
             for (int i = 0; i < 3; ++i)
-                low[i] = high[i] = slice(position.entry(i));
+                low[i] = high[i] = read_scalar(position.entry(i));
         }
         return dr::all(dr::isfinite(low) && dr::isfinite(high) && low <= high);
     }
@@ -726,8 +413,8 @@ private:
                 return dr::mean(mitsuba::unpolarized_spectrum(spectrum));
             };
             if constexpr (dr::is_jit_v<Float>) {
-                power = slice(dr::mean(weight(dr::arange<UInt32>(count)) +
-                                       dr::zeros<Float>(count)));
+                power = read_scalar(dr::mean(weight(dr::arange<UInt32>(count)) +
+                                             dr::zeros<Float>(count)));
             } else {
                 for (uint32_t i = 0; i < count; ++i)
                     power += weight(i) / count;

@@ -1,0 +1,126 @@
+#pragma once
+
+/**
+ * Emission that is constant over an emitter, as the rows of the light table hold it: three
+ * numbers in RGB and monochrome variants, D65 times an upsampled colour in spectral ones.
+ */
+
+#include "light.h"
+#include "parameter_reader.h"
+#include <cmath>
+#include <mitsuba/core/spectrum.h>
+#include <vector>
+
+namespace manylights {
+
+namespace dr = drjit;
+
+/// The value of a variable with one entry
+template <typename Float> float read_scalar(const Float &value) {
+    return (float) dr::slice(value, 0);
+}
+
+template <typename T> void copy3(const T &value, float out[3]) {
+    for (size_t i = 0; i < 3; ++i)
+        out[i] = read_scalar(value.entry(i));
+}
+
+/// A copy of a buffer on the host
+template <typename T, typename Buffer> std::vector<T> download(const Buffer &buffer) {
+    auto host = dr::migrate(buffer, JitBackend::None);
+    if constexpr (dr::is_jit_v<Buffer>)
+        dr::sync_thread();
+    return std::vector<T>(host.data(), host.data() + dr::width(buffer));
+}
+
+/// Emission that does not vary over the emitter
+struct Emission {
+    float color[3] = {};
+    float scale = 1.f, luminance = 0.f;
+    /// Can a row hold it? If not, only `luminance` is valid
+    bool tabulated = false;
+};
+
+template <typename Float, typename Spectrum> struct EmissionReader {
+    /// Emission from the texture `name`; not tabulated if it varies or has another spectrum
+    static Emission read(const ParameterReader &params, const std::string &name) {
+        Emission e;
+        const mitsuba::Object *texture = params.object(name);
+        std::string_view type = texture ? texture->class_name() : std::string_view();
+        using Color =
+            mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
+        const Color *color = params.find<Color>(name + ".value");
+        if constexpr (mitsuba::is_spectral_v<Spectrum>) {
+            using Values = mitsuba::DynamicBuffer<Float>;
+            bool regular = type == "RegularSpectrum";
+            const Values *d65 =
+                params.find<Values>(name + (regular ? ".values" : ".d65.values"));
+            bool has_color = type == "D65Spectrum" && color;
+            if (d65 && (has_color || (regular && is_d65(*d65)))) {
+                e.scale    = scale_of_d65(*d65);
+                e.color[2] = std::numeric_limits<float>::infinity(); // sigmoid of 1
+                if (has_color)
+                    copy3(*color, e.color);
+                e.luminance = spectral_mean(e);
+                e.tabulated = true;
+            }
+        } else {
+            if (type == "SRGBReflectanceSpectrum" && color) {
+                for (size_t i = 0; i < color->size(); ++i)
+                    e.color[i] = read_scalar(color->entry(i));
+                e.tabulated = true;
+            } else if (const Float *value = params.find<Float>(name + ".value");
+                       type == "UniformSpectrum" && value) {
+                std::fill_n(e.color, 3, read_scalar(*value));
+                e.tabulated = true;
+            }
+            e.luminance = luminance(e.color);
+        }
+        return e;
+    }
+
+    static float luminance(const float color[3]) {
+        if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
+            return color[0];
+        else
+            return mitsuba::luminance(
+                mitsuba::Color<float, 3>(color[0], color[1], color[2]));
+    }
+
+private:
+    static float d65_value(size_t i) {
+        return (float) (mitsuba::d65_table[i] * MI_CIE_D65_NORMALIZATION);
+    }
+
+    template <typename Values> static float scale_of_d65(const Values &values) {
+        return (float) dr::slice(values, 0) / d65_value(0);
+    }
+
+    template <typename Values> static bool is_d65(const Values &values) {
+        if (dr::width(values) != MI_CIE_SAMPLES)
+            return false;
+        float scale = scale_of_d65(values);
+        for (size_t i = 1; i < MI_CIE_SAMPLES; ++i) {
+            float expected = scale * d65_value(i);
+            if (std::abs((float) dr::slice(values, i) - expected) > 1e-5f * expected)
+                return false;
+        }
+        return true;
+    }
+
+    /// Mean of scale * D65 * S over the visible range (the stage-3 target's luminance)
+    static float spectral_mean(const Emission &e) {
+        double sum = 0;
+        for (size_t i = 0; i < MI_CIE_SAMPLES; ++i) {
+            double w =
+                MI_CIE_MIN + (MI_CIE_MAX - MI_CIE_MIN) * i / (MI_CIE_SAMPLES - 1.0);
+            double v = (e.color[0] * w + e.color[1]) * w + e.color[2],
+                   s = std::isinf(v) ? (v > 0 ? 1 : 0)
+                                     : .5 + .5 * v / std::sqrt(1 + v * v);
+            sum += d65_value(i) * s;
+        }
+        return (float) (e.scale * sum / MI_CIE_SAMPLES);
+    }
+};
+
+} // namespace manylights

@@ -1,0 +1,75 @@
+#pragma once
+
+/**
+ * The shading point as the tree sees it (\ref Receiver), from Mitsuba's interaction and BSDF,
+ * and the scalar by which contributions are compared.
+ */
+
+#include "importance.h"
+#include <mitsuba/render/bsdf.h>
+#include <mitsuba/render/interaction.h>
+
+namespace manylights {
+
+template <typename Float, typename Spectrum> class ReceiverReader {
+public:
+    MI_IMPORT_TYPES(BSDFPtr)
+    using FloatD = dr::detached_t<Float>;
+
+    /// Positive wherever the value is not zero; invalid values are never chosen
+    static FloatD target(const Spectrum &value) {
+        UnpolarizedSpectrum v = mitsuba::unpolarized_spectrum(value);
+        Float result;
+        if constexpr (mitsuba::is_rgb_v<Spectrum>)
+            result = mitsuba::luminance(v);
+        else
+            result = dr::mean(v);
+        FloatD g = plain(result);
+        return dr::select(g > 0.f && dr::isfinite(g), g, 0.f);
+    }
+
+    /// The lobe is measured only if the scene has any: it costs two evaluations of the BSDF
+    static Receiver<FloatD> read(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
+                                 bool glossy, Mask active) {
+        Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
+        Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
+        Receiver<FloatD> at{ plain(si.p),      plain(n),    plain(si.to_world(si.wi)),
+                             plain(transmits), FloatD(1.f), FloatD(0.f),
+                             FloatD(1.f) };
+        if (glossy)
+            measure_lobe(si, bsdf, at, active);
+        return at;
+    }
+
+private:
+    /**
+     * The glossy lobe, for any BSDF: its value and density in the mirror direction, and its
+     * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.
+     * Only h and H see this, so it does not have to be right.
+     */
+    static void measure_lobe(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
+                             Receiver<FloatD> &at, Mask active) {
+        dr::suspend_grad<Float> detached;
+        mitsuba::BSDFContext ctx;
+        Float cos_i = Frame3f::cos_theta(si.wi);
+        Vector3f mirror(-si.wi.x(), -si.wi.y(), si.wi.z());
+        // At 60 degrees from the normal and at a right angle to the plane of incidence
+        Float inv =
+            .866f * dr::rsqrt(dr::square(si.wi.x()) + dr::square(si.wi.y()) + 1e-12f);
+        Vector3f aside(-si.wi.y() * inv, si.wi.x() * inv, dr::mulsign(Float(.5f), cos_i));
+
+        auto [peak, density] = bsdf->eval_pdf(ctx, si, mirror, active);
+        Spectrum base        = bsdf->eval(ctx, si, aside, active);
+        FloatD cosine        = dr::maximum(dr::abs(plain(cos_i)), 1e-3f);
+        FloatD off = target(base) * 2.f, on = target(peak) / cosine;
+        FloatD alpha2 =
+            dr::rcp(4.f * dr::Pi<FloatD> * cosine *
+                    dr::maximum(plain(density) - cosine * dr::InvPi<FloatD>, .05f));
+        at.alpha2   = dr::clip(alpha2, 1e-5f, 1.f);
+        at.specular = dr::maximum(on - off, 0.f) * at.alpha2;
+        // The share that the lobe never takes away
+        at.diffuse = off + .01f * on + 1e-6f;
+    }
+};
+
+} // namespace manylights

@@ -1,0 +1,109 @@
+#pragma once
+
+/**
+ * What the lights of a scene emit: radiance of a row of the table, of a triangle whose
+ * radiance varies, and of whatever a ray has hit.
+ */
+
+#include "scene_lights.h"
+
+namespace manylights {
+
+template <typename Float, typename Spectrum> class SceneEmission {
+public:
+    MI_IMPORT_TYPES(Scene, Emitter, EmitterPtr)
+    using Lights  = SceneLights<Float, Spectrum>;
+    using FloatD  = typename Lights::FloatD;
+    using UInt32D = typename Lights::UInt32D;
+    using MaskD   = typename Lights::MaskD;
+
+    SceneEmission(const Scene *scene, const Lights &lights)
+        : m_scene(scene), m_lights(lights) {}
+
+    /**
+     * Radiance emitted from a surface (or the environment, without a hit) against the ray
+     * that found it, and the surface's light in the table.
+     */
+    std::pair<Spectrum, UInt32D> emitted(const SurfaceInteraction3f &si,
+                                         Mask active) const {
+        Spectrum result(0.f);
+        UInt32D light(kNone);
+        Mask valid = active && si.is_valid();
+        if (m_lights.can_be_hit()) {
+            light         = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
+            Mask in_table = light < kOnlyHit, by_plugin = light == kOnlyHit;
+            if (dr::any_or<true>(in_table)) {
+                Row<FloatD> row = m_lights.tree().row(light, plain(in_table));
+                Mask tabulated  = in_table && row.tabulated();
+                Mask front      = Frame3f::cos_theta(si.wi) > 0.f;
+                by_plugin |= in_table && !tabulated;
+                if (dr::any_or<true>(tabulated))
+                    result = mitsuba::depolarizer<Spectrum>(color(row, si.wavelengths) &
+                                                            (tabulated && front));
+            }
+            if (m_lights.needs_emitter_eval())
+                add_masked(result, by_plugin,
+                           [&](Mask m) { return si.shape->emitter()->eval(si, m); });
+        }
+        if (const Emitter *environment = m_scene->environment())
+            add_masked(result, active && !si.is_valid(),
+                       [&](Mask m) { return environment->eval(si, m); });
+        return { result, light };
+    }
+
+    EmitterPtr emitter_of(const Row<FloatD> &row) const {
+        using UInt32 = dr::uint32_array_t<Float>;
+        return dr::gather<EmitterPtr>(m_scene->emitters_dr(), UInt32(row.emitter()),
+                                      Mask(true));
+    }
+
+    /// Radiance or intensity of a tabulated row
+    static UnpolarizedSpectrum color(const Row<FloatD> &row,
+                                     const Wavelength &wavelengths) {
+        if constexpr (mitsuba::is_spectral_v<Spectrum>) {
+            dr::Array<Float, 3> coefficients(row[kColor], row[kColor + 1],
+                                             row[kColor + 2]);
+            return Float(row[kScale]) *
+                   mitsuba::cie_d65<UnpolarizedSpectrum>(wavelengths) *
+                   mitsuba::srgb_model_eval<UnpolarizedSpectrum>(coefficients,
+                                                                 wavelengths);
+        } else {
+            UnpolarizedSpectrum result;
+            for (size_t i = 0; i < result.size(); ++i)
+                result.entry(i) = row[kColor + i];
+            return result;
+        }
+    }
+
+    /// Radiance of a triangle whose emission varies, from its emitter
+    Spectrum triangle_emission(const SurfaceInteraction3f &from, const Row<FloatD> &row,
+                               const LightPoint<FloatD> &point, const Vector3f &d,
+                               Mask active) const {
+        EmitterPtr emitter           = emitter_of(row);
+        PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
+        MaskD flipped                = row[kColor + 1] > 0.f;
+        pi.valid                     = active;
+        pi.t                         = dr::norm(Point3f(point.p) - from.p);
+        pi.prim_uv    = Point2f(dr::select(flipped, point.uv.y(), point.uv.x()),
+                                dr::select(flipped, point.uv.x(), point.uv.y()));
+        pi.prim_index = row.bits(kColor);
+        pi.shape      = emitter->shape();
+        Ray3f ray(from.p, d, from.time, from.wavelengths);
+        SurfaceInteraction3f si =
+            pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, active);
+        return emitter->eval(si, active);
+    }
+
+    /// Add f(mask) where the mask is set; scalar variants do not call f otherwise
+    template <typename F>
+    static void add_masked(Spectrum &result, Mask mask, const F &f) {
+        if (dr::any_or<true>(mask))
+            dr::masked(result, mask) = result + f(mask);
+    }
+
+private:
+    const Scene *m_scene;
+    const Lights &m_lights;
+};
+
+} // namespace manylights
