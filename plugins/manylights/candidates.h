@@ -153,7 +153,7 @@ private:
         s.x = inside((s.x - choice.lower) / choice.probability);
         /* A descent magnifies the rounding of x. Where the interval becomes too small for a
            second point, x is uniform in it, so low-order digits may be added. */
-        Mask single = expected * s.place.width > 1.f && expected * child.width <= 1.f;
+        Mask single = expected * s.place.width >= 1.f && expected * child.width <= 1.f;
         Float x     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
         s.x = dr::select(single, inside(x - dr::select(x >= 1.f, Float(1.f), 0.f)), s.x);
         s.place = child;
@@ -306,8 +306,7 @@ private:
             auto axis =
                 dr::reinterpret_array<dr::int32_array_t<Float>>(view.data.entry(11));
             for (int i = 0; i < 3; ++i)
-                clusters.axis[i].entry(slot) =
-                    Float((axis << (22 - 10 * i)) >> 22) * (1.f / 511.f);
+                clusters.axis[i].entry(slot) = unpack_axis<Float>(axis, i);
         }
         return child_probabilities(tree, at, clusters).entry(0);
     }

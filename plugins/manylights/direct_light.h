@@ -23,6 +23,7 @@
 #include "parameters.h"
 #include "receiver.h"
 #include "scene_emission.h"
+#include <array>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/integrator.h>
 #include <mitsuba/render/sampler.h>
@@ -62,7 +63,7 @@ public:
         float most = m_all ? (float) count : params.most_candidates();
         m_keep_all = most <= (float) params.reservoirs;
         m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
-        m_items    = m_slots + (uint32_t) lights.infinite().size();
+        m_items    = m_slots + infinite_items();
         m_choose   = m_items > params.shadow_rays;
     }
 
@@ -127,6 +128,7 @@ private:
         Point3f p;
         DRJIT_STRUCT(Sample, value, p)
     };
+    using InfiniteSamples = std::array<Sample, kMaxInfinite>;
 
     /// The lights that reach stage 3, at most one in each slot
     struct Kept {
@@ -289,11 +291,11 @@ private:
     // ------------------------------------------------------------------------ Stage 3
 
     Spectrum trace_kept(const Shading &shading, Kept kept, Mask active) const {
-        std::vector<Sample> infinite = sample_infinite(shading, active);
-        FloatD offset                = plain(shading.u.selection);
+        InfiniteSamples infinite = sample_infinite(shading, active);
+        FloatD offset            = plain(shading.u.selection);
         FloatD tau(0.f);
         if (m_choose) {
-            for (size_t i = 0; i < infinite.size(); ++i)
+            for (size_t i = 0; i < infinite_items(); ++i)
                 kept.target[m_slots + i] = Reader::target(infinite[i].value);
             tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays);
         }
@@ -325,7 +327,7 @@ private:
 
     /// The chosen item's contribution, with visibility
     Spectrum trace(const Shading &shading, const Kept &kept,
-                   const std::vector<Sample> &infinite, const Selected<FloatD> &chosen,
+                   const InfiniteSamples &infinite, const Selected<FloatD> &chosen,
                    Mask active) const {
         active &= chosen.valid;
         Sample sample = dr::zeros<Sample>();
@@ -339,11 +341,12 @@ private:
                 /* target_only = */ false, finite);
             sample.value = sample.value * Float(weight) & finite;
         }
-        for (size_t i = 0; i < infinite.size(); ++i)
+        for (size_t i = 0; i < infinite_items(); ++i)
             sample = dr::select(active && chosen.item == (uint32_t) (m_slots + i),
                                 infinite[i], sample);
 
-        active &= dr::any(mitsuba::unpolarized_spectrum(sample.value) != 0.f);
+        active &=
+            Mask(Reader::target(sample.value) > 0.f); // drops invalid values as well
         if (dr::none_or<false>(active))
             return Spectrum(0.f);
         Mask occluded = m_scene->ray_test(shading.si.spawn_ray_to(sample.p), active);
@@ -463,12 +466,36 @@ private:
         return { f * weight & active, ds.p };
     }
 
-    std::vector<Sample> sample_infinite(const Shading &shading, Mask active) const {
-        std::vector<Sample> samples;
-        for (const Emitter *emitter : m_lights.infinite()) {
-            Point2f u =
-                slot_point(shading.u.point, UInt32D(m_slots + (uint32_t) samples.size()));
-            samples.push_back(sample_emitter(shading, emitter, u, Float(1.f), active));
+    /// Lights at infinity in stage 3: all of them, or one chosen at random if there are many
+    uint32_t infinite_items() const {
+        uint32_t count = (uint32_t) m_lights.infinite().size();
+        return count <= kMaxInfinite ? count : 1;
+    }
+
+    /// Probability with which a light at infinity is an item
+    float infinite_probability() const {
+        uint32_t count = (uint32_t) m_lights.infinite().size();
+        return count <= kMaxInfinite ? 1.f : 1.f / count;
+    }
+
+    InfiniteSamples sample_infinite(const Shading &shading, Mask active) const {
+        InfiniteSamples samples;
+        float p = infinite_probability();
+        for (uint32_t i = 0; i < infinite_items(); ++i) {
+            Point2f u = slot_point(shading.u.point, UInt32D(m_slots + i));
+            if (p == 1.f) {
+                samples[i] = sample_emitter(shading, m_lights.infinite()[i], u,
+                                            Float(1.f), active);
+                continue;
+            }
+            using UInt32   = dr::uint32_array_t<Float>;
+            uint32_t count = (uint32_t) m_lights.infinite().size();
+            UInt32 index   = dr::minimum(UInt32(u.x() * (float) count), count - 1u);
+            u.x()          = u.x() * (float) count - Float(index);
+            EmitterPtr emitter =
+                dr::gather<EmitterPtr>(m_lights.infinite_dr(), index, active);
+            samples[i] = sample_emitter(shading, emitter, u, Float(p), active);
+            samples[i].value *= (float) count;
         }
         return samples;
     }
@@ -507,7 +534,8 @@ private:
         if (const Emitter *environment = m_scene->environment();
             environment && dr::any_or<true>(missed)) {
             DirectionSample3f ds(m_scene, hit, si);
-            dr::masked(result, missed) = environment->pdf_direction(si, ds, missed);
+            dr::masked(result, missed) =
+                infinite_probability() * environment->pdf_direction(si, ds, missed);
         }
         return result;
     }

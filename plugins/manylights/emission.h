@@ -23,8 +23,6 @@ template <typename Float> struct LightPoint {
     using Point3f  = mitsuba::Point<Float, 3>;
 
     Point3f p;
-    /// Geometric normal on the emitting side; 0 for points and spots
-    Vector3f n;
     /// Density in solid angle; 1 for points and spots; 0 if nothing can arrive
     Float pdf;
     /// The radiance or intensity times this, over the density, is what arrives
@@ -32,14 +30,16 @@ template <typename Float> struct LightPoint {
     /// Barycentric coordinates (triangles only)
     Point2f uv;
 
-    DRJIT_STRUCT(LightPoint, p, n, pdf, weight, uv)
+    DRJIT_STRUCT(LightPoint, p, pdf, weight, uv)
 };
 
 /// Density in solid angle of a uniform density on `area`, 0 behind a one-sided emitter
 template <typename Float>
 Float area_to_solid_angle(const Float &area, const mitsuba::Vector<Float, 3> &w,
-                          const mitsuba::Vector<Float, 3> &n) {
+                          const mitsuba::Vector<Float, 3> &n,
+                          const dr::mask_t<Float> &two_sided = false) {
     Float d2 = dr::squared_norm(w), cosine = -dr::dot(w, n) * dr::rsqrt(d2);
+    cosine    = dr::select(two_sided, dr::abs(cosine), cosine);
     Float pdf = d2 / (area * cosine);
     return dr::select(cosine > 0.f && dr::isfinite(pdf), pdf, 0.f);
 }
@@ -94,29 +94,32 @@ LightPoint<Float> sample_sphere(const Row<Float> &row, const mitsuba::Point<Floa
     LightPoint<Float> result = dr::zeros<LightPoint<Float>>();
     Vector3f d = dr::select(cone.outside, outside, inside), n = d * row[4];
     result.p   = row.vector(0) + radius * d;
-    result.n   = n;
     result.pdf = sphere_pdf<Float>(cone, radius, result.p - x, n);
     return result;
+}
+
+/// Density of the direction w to a uniform point of a triangle or a disk
+template <typename Float>
+Float flat_pdf(const Row<Float> &row, LightKind kind,
+               const mitsuba::Vector<Float, 3> &w) {
+    auto normal   = dr::cross(row.vector(3), row.vector(6));
+    Float length  = dr::norm(normal);
+    bool triangle = kind == LightKind::Triangle;
+    return area_to_solid_angle<Float>(length * (triangle ? .5f : dr::Pi<float>), w,
+                                      normal / length, triangle && row.two_sided());
 }
 
 template <typename Float>
 LightPoint<Float> sample_flat(const Row<Float> &row, LightKind kind,
                               const mitsuba::Point<Float, 3> &x,
                               const mitsuba::Point<Float, 2> &u) {
-    using Vector3f = mitsuba::Vector<Float, 3>;
     namespace warp = mitsuba::warp;
-    bool triangle  = kind == LightKind::Triangle;
-    auto b         = triangle ? warp::square_to_uniform_triangle(u)
-                              : warp::square_to_uniform_disk_concentric(u);
-    Vector3f s = row.vector(3), t = row.vector(6), n = dr::cross(s, t);
-    Float length = dr::norm(n);
-
+    auto b = kind == LightKind::Triangle ? warp::square_to_uniform_triangle(u)
+                                         : warp::square_to_uniform_disk_concentric(u);
     LightPoint<Float> result = dr::zeros<LightPoint<Float>>();
-    result.p                 = row.vector(0) + b.x() * s + b.y() * t;
-    result.n                 = n / length;
-    result.uv                = b;
-    result.pdf = area_to_solid_angle<Float>(length * (triangle ? .5f : dr::Pi<float>),
-                                            result.p - x, result.n);
+    result.p   = row.vector(0) + b.x() * row.vector(3) + b.y() * row.vector(6);
+    result.uv  = b;
+    result.pdf = flat_pdf<Float>(row, kind, result.p - x);
     return result;
 }
 
@@ -133,9 +136,8 @@ LightPoint<Float> sample_cylinder(const Row<Float> &row,
 
     LightPoint<Float> result = dr::zeros<LightPoint<Float>>();
     result.p                 = row.vector(0) + u.x() * axis + radius * radial;
-    result.n                 = radial * row[7];
     result.pdf = area_to_solid_angle<Float>(dr::TwoPi<Float> * radius * length,
-                                            result.p - x, result.n);
+                                            result.p - x, radial * row[7]);
     return result;
 }
 
@@ -184,13 +186,8 @@ Float light_pdf(const Row<Float> &row, LightKind kind, const mitsuba::Point<Floa
     Vector3f w     = p - x;
     switch (kind) {
         case LightKind::Triangle:
-        case LightKind::Disk: {
-            Vector3f normal = dr::cross(row.vector(3), row.vector(6));
-            Float length    = dr::norm(normal);
-            bool triangle   = kind == LightKind::Triangle;
-            return area_to_solid_angle<Float>(length * (triangle ? .5f : dr::Pi<float>),
-                                              w, normal / length);
-        }
+        case LightKind::Disk:
+            return flat_pdf<Float>(row, kind, w);
         case LightKind::Sphere: {
             SphereCone<Float> cone(row.vector(0) - x, row[3]);
             return sphere_pdf<Float>(cone, row[3], w, n);

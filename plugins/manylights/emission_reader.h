@@ -76,6 +76,9 @@ template <typename Float, typename Spectrum> struct EmissionReader {
             }
             e.luminance = luminance(e.color);
         }
+        // A value in the table has no derivative: let the emitter evaluate it instead
+        if (color && dr::grad_enabled(*color))
+            e.tabulated = false;
         return e;
     }
 

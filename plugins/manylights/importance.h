@@ -122,6 +122,7 @@ template <typename Float> struct Row {
     UInt32 kind() const { return bits(kTag) & kTagKindMask; }
     Mask is(LightKind k) const { return kind() == (uint32_t) k; }
     Mask tabulated() const { return (bits(kTag) & kTagTabulated) != 0u; }
+    Mask two_sided() const { return (bits(kTag) & kTagTwoSided) != 0u; }
     UInt32 emitter() const { return bits(kTag) >> kTagEmitterShift; }
 };
 
@@ -197,11 +198,12 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
         }
         case LightKind::Triangle: {
             Vector3f e1 = row.vector(3), e2 = row.vector(6), a = .5f * dr::cross(e1, e2),
-                     w = origin + (e1 + e2) * (1.f / 3.f);
-            // A smooth normal may lie on the other side of the plane: leave a floor
-            Float floor = dr::select(row.tabulated(), 0.f, .05f * dr::norm(a));
-            return { w, .16f * dr::norm(a),
-                     dr::maximum(flat_intensity<Float>(a, w), floor) };
+                     w  = origin + (e1 + e2) * (1.f / 3.f);
+            Float front = flat_intensity<Float>(a, w),
+                  back  = flat_intensity<Float>(-a, w);
+            // Edge-on to a smooth triangle some normals may still face x: leave a floor
+            Float both = dr::maximum(front + back, .05f * dr::norm(a));
+            return { w, .16f * dr::norm(a), dr::select(row.two_sided(), both, front) };
         }
         case LightKind::Disk: {
             Vector3f a = dr::Pi<Float> * dr::cross(row.vector(3), row.vector(6));
@@ -226,8 +228,8 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
  * with the light's own extent instead of a cluster's.
  *
  * For a flat emitter of area A the distance^2 is d^2 + .08 A, half of its variance; a point
- * on the surface then has no pole. It is zero only behind a flat emitter and outside of a
- * spot's cone.
+ * on the surface then has no pole. It is zero only behind a one-sided flat emitter and
+ * outside of a spot's cone.
  */
 template <typename Float>
 Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds,

@@ -46,8 +46,9 @@ constexpr uint32_t kOnlyHit = 0xfffffffeu;
  * variants; in spectral ones it is scale * D65(lambda) * S(color, lambda), with S
  * Mitsuba's sigmoid upsampling of the coefficients `color`. A row that is not
  * `tabulated` has its emission evaluated by its emitter; `color[0]` then holds the bits
- * of the triangle's index and `color[1]` is 1 if its two edges were swapped (flipped
- * normals), 0 if not.
+ * of the triangle's index and `color[1]` is 1 if its two edges were swapped to make it emit
+ * to the right side, 0 if not. A triangle with smooth normals is sampled on both sides
+ * (kTagTwoSided), since the side on which it emits changes from point to point.
  */
 struct LightRow {
     float geometry[9] = {};
@@ -76,7 +77,8 @@ enum RowField : size_t {
 
 constexpr uint32_t kTagKindMask     = 7;
 constexpr uint32_t kTagTabulated    = 8;
-constexpr uint32_t kTagEmitterShift = 4;
+constexpr uint32_t kTagTwoSided     = 16;
+constexpr uint32_t kTagEmitterShift = 5;
 
 /// Pack kind, "radiance is in the table" and the index into the scene's emitters
 constexpr uint32_t make_tag(LightKind kind, bool tabulated, uint32_t emitter) {

@@ -33,13 +33,14 @@ public:
     public:
         Rendering(const LightCache &cache, const Scene *scene) : m_cache(cache) {
             cache.update(scene);
-            cache.m_rendering = scene;
+            m_outer = cache.m_rendering.exchange(scene);
         }
-        ~Rendering() { m_cache.m_rendering = nullptr; }
+        ~Rendering() { m_cache.m_rendering = m_outer; }
         Rendering(const Rendering &) = delete;
 
     private:
         const LightCache &m_cache;
+        const Scene *m_outer;
     };
 
     /// The lights of a scene, for `sample()`; cheap enough for every ray
@@ -130,6 +131,11 @@ private:
         mitsuba::ref<Lights> lights = new Lights(scene, m_keep_binary);
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
         m_current = nullptr;
+        // Another thread may still be rendering with what is replaced
+        if (!m_rendering)
+            m_retired.clear();
+        if (m_entries[slot])
+            m_retired.push_back(std::move(m_entries[slot]));
         m_entries[slot].reset(new Entry{ scene, std::move(fingerprint), lights });
         return m_entries[slot].get();
     }
@@ -161,6 +167,7 @@ private:
     bool m_keep_binary;
     mutable std::mutex m_mutex;
     mutable std::unique_ptr<Entry> m_entries[2];
+    mutable std::vector<std::unique_ptr<Entry>> m_retired;
     mutable std::atomic<Entry *> m_current{ nullptr };
     /// The scene whose lights `render()` has just checked
     mutable std::atomic<const Scene *> m_rendering{ nullptr };

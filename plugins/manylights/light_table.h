@@ -45,6 +45,8 @@ template <typename Float, typename Spectrum> struct HostTable {
     uint32_t light_count = 0;
     /// Is there an emissive surface whose radiance is not in the table?
     bool needs_emitter_eval = false;
+    /// Can a ray hit any light?
+    bool can_be_hit = false;
 };
 
 template <typename Float, typename Spectrum> class LightTableReader {
@@ -73,7 +75,7 @@ private:
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
         else if (surface && !emitter->shape())
             add_unattached(emitter);
-        else if (surface && name == "AreaLight")
+        else if (surface)
             add_area(emitter, emitter->shape());
         else if (name == "PointLight")
             add_point(emitter);
@@ -124,14 +126,18 @@ private:
             row.geometry[3 + i] = matrix[i][2] / length;
         }
         row.geometry[6] = cutoff;
-        row.geometry[7] = std::min(1.f / (cutoff - beam), 1e10f);
+        // Without a transition (or an inverted one) the edge is hard
+        row.geometry[7] = cutoff > beam ? std::min(1.f / (cutoff - beam), 1e10f) : 1e10f;
 
         LightBounds bounds = point_bounds(row.geometry);
         std::copy_n(row.geometry + 3, 3, bounds.axis);
         // sqrt(flux * 4 pi * peak), see LightBounds
-        float flux  = 2 * dr::Pi<float> * e.luminance *
-                      (1 - .5f * (std::cos(beam) + std::cos(cutoff)));
-        bounds.flux = std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
+        // (1 - cos) as 2 sin^2, without cancellation
+        float sin_beam   = std::sin(.5f * std::min(beam, cutoff)),
+              sin_cutoff = std::sin(.5f * cutoff);
+        float flux       = 2 * dr::Pi<float> * e.luminance *
+                           (sin_beam * sin_beam + sin_cutoff * sin_cutoff);
+        bounds.flux      = std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
         add_light(row, bounds);
     }
 
@@ -162,12 +168,13 @@ private:
         ParameterReader params(emitter);
         Emission e     = EmissionReader<Float, Spectrum>::read(params, "radiance");
         uint32_t first = (uint32_t) m_table.light_of_primitive.size();
-        if (shape->is_mesh()) {
+        bool known     = emitter->class_name() == "AreaLight";
+        if (known && shape->is_mesh()) {
             add_mesh(emitter, (const Mesh *) shape, e, params.object("radiance"));
         } else {
             std::string_view name = shape->class_name();
             uint32_t light        = (uint32_t) m_table.rows.size();
-            if (!e.tabulated)
+            if (!known || !e.tabulated)
                 add_other(emitter);
             else if (name == "Sphere")
                 add_sphere(shape, e);
@@ -279,20 +286,46 @@ private:
         if (!constant.tabulated)
             emission = MeshEmission<Float, Spectrum>(emitter, mesh).read(texture);
 
+        std::vector<float> normals = download<float>(mesh->vertex_normals_buffer());
         for (size_t f = 0; f < count; ++f) {
             uint32_t light = (uint32_t) m_table.rows.size();
-            Emission e     = emission[f];
-            // With smooth normals the emitting side depends on the point: ask the emitter,
-            // which compares with the shading normal
-            e.tabulated &= !mesh->has_vertex_normals();
-            add_triangle(vertices, &faces[3 * f], e, (uint32_t) f,
-                         mesh->has_flipped_normals());
+            Side side      = emitting_side(vertices, normals, &faces[3 * f]);
+            if (mesh->has_flipped_normals() && side != Side::Both)
+                side = side == Side::Front ? Side::Back : Side::Front;
+            add_triangle(vertices, &faces[3 * f], emission[f], (uint32_t) f, side);
             push_primitive(light);
         }
     }
 
+    /// The side of a triangle, by its winding, on which it emits: that of the shading normal
+    enum class Side { Front, Back, Both };
+
+    static Side emitting_side(const std::vector<float> &vertices,
+                              const std::vector<float> &normals, const uint32_t *face) {
+        if (normals.empty())
+            return Side::Front;
+        auto corner = [&](const std::vector<float> &buffer, int i) {
+            const float *v = &buffer[3 * face[i]];
+            return mitsuba::Vector<float, 3>(v[0], v[1], v[2]);
+        };
+        auto v0 = corner(vertices, 0);
+        auto n =
+            dr::normalize(dr::cross(corner(vertices, 1) - v0, corner(vertices, 2) - v0));
+        float low = 1, high = -1;
+        for (int i = 0; i < 3; ++i) {
+            float cosine = dr::dot(n, dr::normalize(corner(normals, i)));
+            low          = std::min(low, cosine);
+            high         = std::max(high, cosine);
+        }
+        constexpr float flat = .999999f; // a tenth of a degree
+        return low > flat ? Side::Front : (high < -flat ? Side::Back : Side::Both);
+    }
+
     void add_triangle(const std::vector<float> &vertices, const uint32_t *face,
-                      const Emission &e, uint32_t face_index, bool flip) {
+                      Emission e, uint32_t face_index, Side side) {
+        // With smooth normals only the emitter knows where it emits
+        e.tabulated &= side != Side::Both;
+        bool flip       = side == Side::Back;
         LightRow row    = make_row(LightKind::Triangle, e);
         const float *v0 = &vertices[3 * face[0]], *v1 = &vertices[3 * face[1]],
                     *v2 = &vertices[3 * face[2]];
@@ -314,6 +347,10 @@ private:
         bounds.variance = (float) (square / 36); // of a uniform point; trace / 3
         float area      = .5f * set_axis(bounds, row.geometry + 3, row.geometry + 6);
         bounds.flux     = area * dr::Pi<float> * e.luminance;
+        if (side == Side::Both) {
+            row.tag |= kTagTwoSided;
+            std::fill_n(bounds.axis, 3, 0.f);
+        }
         if (!e.tabulated) {
             std::memcpy(&row.color[0], &face_index, sizeof(float));
             row.color[1] = flip ? 1.f : 0.f;
@@ -329,6 +366,8 @@ private:
         if (!can_sample(emitter))
             return add_only_hit();
         if (!find_bounds(emitter, low, high)) {
+            if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface))
+                return add_only_hit();
             // Without a place it cannot be in the tree: always a candidate
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
@@ -366,8 +405,8 @@ private:
     /// Count a light that only rays can find
     void add_only_hit() {
         ++m_table.light_count;
-        m_table.needs_emitter_eval = true;
-        m_only_hit                 = true;
+        m_table.needs_emitter_eval = m_table.can_be_hit = true;
+        m_only_hit                                      = true;
     }
 
     /// Some shapes of Mitsuba (curves) have no way to choose a point on them
@@ -479,9 +518,11 @@ private:
         for (int i = 0; i < 3; ++i)
             finite &=
                 std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
-        bool hit_able  = (row.tag & kTagKindMask) > (uint32_t) LightKind::Spot;
+        bool hit_able  = has_flag(m_scene->emitters()[m_emitter]->flags(),
+                                  mitsuba::EmitterFlags::Surface);
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
+        m_table.can_be_hit |= hit_able;
         if (!finite || !(bounds.flux > 0)) {
             m_only_hit = by_plugin; // black as far as the quadrature saw
             return;

@@ -49,6 +49,12 @@ template <typename Float> struct TreeView {
     }
 };
 
+/// One coordinate of an axis that \ref pack_axis packed into signed fields of 10 bits
+template <typename Value>
+Value unpack_axis(const dr::int32_array_t<Value> &packed, int coordinate) {
+    return Value((packed << (22 - 10 * coordinate)) >> 22) * (1.f / 511.f);
+}
+
 /// A wide node, gathered
 template <typename Float> struct WideNodeView {
     using UInt32 = dr::uint32_array_t<Float>;
@@ -105,8 +111,8 @@ dr::Array<Float, 4> child_probabilities(const TreeView<Float> &tree,
     Float sum_h    = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     Float sum_flux = (clusters.flux.entry(0) + clusters.flux.entry(1)) +
                      (clusters.flux.entry(2) + clusters.flux.entry(3));
-    // On top of a light h overflows: then the flux alone decides
-    auto usable   = sum_h > 0.f && sum_h < 1e30f;
+    // On top of a light h overflows, very far away it vanishes: then the flux alone decides
+    auto usable   = sum_h > 1e-30f && sum_h < 1e30f;
     Float share   = dr::select(usable, Float(kDefensiveShare), 1.f);
     Float scale_h = dr::select(usable, (1.f - kDefensiveShare) / sum_h, 0.f);
     Four<Float> q = dr::fmadd(dr::select(usable, h, 0.f), Four<Float>(scale_h),

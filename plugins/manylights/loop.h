@@ -36,6 +36,8 @@ using Four = std::conditional_t<dr::is_jit_v<Float>, dr::Array<Float, 4>,
 
 /// Hard limit on the number of reservoirs: their state lives in registers
 constexpr uint32_t kMaxReservoirs = 64;
+/// Lights at infinity that all take part in stage 3; of more, one is chosen at random
+constexpr uint32_t kMaxInfinite = 8;
 
 /// A small array whose length is set at run time, in place of a heap allocation per sample
 template <typename T> class FixedArray {
@@ -56,7 +58,7 @@ public:
     const T &operator[](size_t i) const { return m_data[i]; }
 
 private:
-    T m_data[kMaxReservoirs];
+    T m_data[kMaxReservoirs + kMaxInfinite];
     size_t m_size = 0;
 };
 

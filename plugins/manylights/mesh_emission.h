@@ -76,12 +76,27 @@ private:
         si.prim_index = face;
         si.wi         = { 0.f, 0.f, 1.f };
         if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            si.wavelengths = { 450.f, 520.f, 590.f, 650.f };
+            return Color3fOf<Float>(spectral_mean(si));
         auto value = mitsuba::unpolarized_spectrum(m_emitter->eval(si, true));
         if constexpr (mitsuba::is_rgb_v<Spectrum>)
             return value;
         else
             return Color3fOf<Float>(dr::mean(value));
+    }
+
+    /// Mean over wavelengths so close that a narrow line cannot hide between them
+    Float spectral_mean(SurfaceInteraction3f &si) const {
+        constexpr size_t count = 48;
+        Float sum(0.f);
+        size_t lanes = si.wavelengths.size();
+        for (size_t i = 0; i < count; i += lanes) {
+            for (size_t k = 0; k < lanes; ++k)
+                si.wavelengths.entry(k) =
+                    (float) (MI_CIE_MIN +
+                             (MI_CIE_MAX - MI_CIE_MIN) * (i + k + .5) / count);
+            sum += dr::mean(mitsuba::unpolarized_spectrum(m_emitter->eval(si, true)));
+        }
+        return sum * ((float) lanes / count);
     }
 
     /// Attributes are linear over a face: their mean is that of the corners

@@ -25,7 +25,8 @@ public:
         else
             result = dr::mean(v);
         FloatD g = plain(result);
-        return dr::select(g > 0.f && dr::isfinite(g), g, 0.f);
+        // Bounded, so that sums of targets and weights stay finite
+        return dr::select(g > 0.f && dr::isfinite(g), dr::minimum(g, 1e25f), 0.f);
     }
 
     /// The lobe is measured only if the scene has any: it costs two evaluations of the BSDF

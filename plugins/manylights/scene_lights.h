@@ -27,7 +27,7 @@ public:
             dr::scoped_set_flag guard(JitFlag::EnableObjectTraversal, true);
             object->traverse_1_cb_ro(
                 this, [](void *self, uint64_t index, const char *, const char *) {
-                    ((Fingerprint *) self)->hold((uint32_t) index);
+                    ((Fingerprint *) self)->hold(index);
                 });
         } else {
             ValueHash callback(*this);
@@ -51,27 +51,49 @@ public:
             jit_var_dec_ref(index);
     }
 
-private:
     void mix(uint64_t value) { // FNV-1a over 64-bit words
         m_hash = (m_hash ^ value) * 0x100000001b3ull;
         m_hash ^= m_hash >> 29;
     }
 
-    void hold(uint32_t index) {
-        mix(index);
-        if (index) {
+private:
+    /// The upper half tells whether the variable has a gradient
+    void hold(uint64_t combined) {
+        mix(combined);
+        if (uint32_t index = (uint32_t) combined) {
             jit_var_inc_ref(index);
             m_held.push_back(index);
         }
     }
 
-    void mix_floats(const float *data, size_t size) {
+    void mix_bytes(const void *data, size_t size) {
         mix(size);
-        for (size_t i = 0; i < size; ++i) {
-            uint32_t bits;
-            std::memcpy(&bits, data + i, sizeof(bits));
-            mix(bits);
+        for (size_t i = 0; i < size; i += sizeof(uint64_t)) {
+            uint64_t word = 0;
+            std::memcpy(&word, (const char *) data + i, std::min(sizeof(word), size - i));
+            mix(word);
         }
+    }
+
+    /// Mix a value if it is one of the types
+    template <typename... Ts>
+    void mix_plain(const void *value, const std::type_info &type) {
+        ((type == typeid(Ts) ? mix_bytes(value, sizeof(Ts)) : void()), ...);
+    }
+
+    /// Mix a buffer or a tensor if its entries are of one of the types
+    template <typename... Ts> void mix_buffer(void *value, const std::type_info &type) {
+        auto mix_array = [&](auto *array) {
+            using Value = dr::scalar_t<std::decay_t<decltype(*array)>>;
+            mix_bytes(array->data(), array->size() * sizeof(Value));
+        };
+        ((type == typeid(dr::DynamicArray<Ts>) ? mix_array((dr::DynamicArray<Ts> *) value)
+                                               : void()),
+         ...);
+        ((type == typeid(dr::Tensor<dr::DynamicArray<Ts>>)
+              ? mix_array((dr::Tensor<dr::DynamicArray<Ts>> *) value)
+              : void()),
+         ...);
     }
 
     struct ValueHash : mitsuba::TraversalCallback {
@@ -80,20 +102,13 @@ private:
 
         void put_value(std::string_view, void *value, uint32_t,
                        const std::type_info &type) override {
-            using Buffer = dr::DynamicArray<float>;
-            using Tensor = dr::Tensor<Buffer>;
-            using Core   = mitsuba::CoreAliases<float>;
-            if (type == typeid(float) || type == typeid(int) || type == typeid(uint32_t))
-                out.mix_floats((const float *) value, 1);
-            else if (type == typeid(mitsuba::Color<float, 3>) ||
-                     type == typeid(mitsuba::Point<float, 3>))
-                out.mix_floats((const float *) value, 3);
-            else if (type == typeid(typename Core::AffineTransform4f))
-                out.mix_floats((const float *) value, 12);
-            else if (type == typeid(Buffer))
-                out.mix_floats(((Buffer *) value)->data(), ((Buffer *) value)->size());
-            else if (type == typeid(Tensor))
-                out.mix_floats(((Tensor *) value)->data(), ((Tensor *) value)->size());
+            using Core = mitsuba::CoreAliases<float>;
+            out.template mix_plain<bool, float, double, int32_t, uint32_t,
+                                   mitsuba::Color<float, 1>, mitsuba::Color<float, 3>,
+                                   mitsuba::Point<float, 2>, mitsuba::Point<float, 3>,
+                                   mitsuba::Vector<float, 2>, mitsuba::Vector<float, 3>,
+                                   typename Core::AffineTransform4f>(value, type);
+            out.template mix_buffer<float, uint32_t, dr::half>(value, type);
         }
 
         void put_object(std::string_view, Object *object, uint32_t) override {
@@ -127,8 +142,12 @@ public:
         LightTree tree             = build_tree(table.bounds, keep_binary);
         std::vector<LightRow> rows = ordered_rows(table, tree);
 
-        m_infinite           = std::move(table.infinite);
+        m_infinite = std::move(table.infinite);
+        if (!m_infinite.empty())
+            m_infinite_dr = dr::load<mitsuba::DynamicBuffer<EmitterPtr>>(
+                m_infinite.data(), m_infinite.size());
         m_needs_emitter_eval = table.needs_emitter_eval;
+        m_can_be_hit         = table.can_be_hit;
         for (const LightRow &row : rows)
             m_tree.kinds.insert((LightKind) (row.tag & kTagKindMask));
         for (const LightBounds &bounds : table.bounds)
@@ -165,22 +184,24 @@ public:
         Fingerprint<Float> result;
         for (const auto &emitter : scene->emitters()) {
             result.add(emitter.get());
-            if (emitter->shape())
-                result.add(emitter->shape());
+            result.mix(emitter->flags());
+            if (const Shape *shape = emitter->shape()) {
+                result.add(shape);
+                result.mix(shape->has_flipped_normals());
+            }
         }
         return result;
     }
 
     const Tree &tree() const { return m_tree; }
     const std::vector<const Emitter *> &infinite() const { return m_infinite; }
+    /// The same as a buffer for kernels
+    const mitsuba::DynamicBuffer<EmitterPtr> &infinite_dr() const {
+        return m_infinite_dr;
+    }
     const Statistics &statistics() const { return m_statistics; }
     /// Can a ray hit any light at all? If not, BSDF sampling cannot contribute
-    bool can_be_hit() const {
-        KindSet delta;
-        delta.insert(LightKind::Point);
-        delta.insert(LightKind::Spot);
-        return (m_tree.kinds.bits & ~delta.bits) != 0 || m_needs_emitter_eval;
-    }
+    bool can_be_hit() const { return m_can_be_hit; }
     /// Is there an emissive surface whose radiance is not in the table?
     bool needs_emitter_eval() const { return m_needs_emitter_eval; }
 
@@ -258,7 +279,8 @@ private:
     IndexStorage m_light_of_primitive, m_shape_lights;
     std::unordered_map<const Shape *, ShapeLights<Shape>> m_shape_map;
     std::vector<const Emitter *> m_infinite;
-    bool m_needs_emitter_eval = false;
+    mitsuba::DynamicBuffer<EmitterPtr> m_infinite_dr;
+    bool m_needs_emitter_eval = false, m_can_be_hit = false;
     Statistics m_statistics;
 };
 
