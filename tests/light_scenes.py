@@ -293,6 +293,41 @@ def sky():
     return {**stage(), **lights, **points(40, total=4.0)}
 
 
+def mirrored():
+    """Rectangles, cubes and disks under mirroring transformations, some with flipped normals."""
+    lights = {}
+    for kind, flip in (("rectangle", False), ("rectangle", True), ("cube", False), ("disk", True)):
+        for key, light in shapes(kind, 6, seed=len(lights)).items():
+            # Twice flipped is not flipped: all of them still face the floor
+            scale = [1, 1, -1] if flip else [-1, 1, 1]
+            light["to_world"] = light["to_world"].scale(scale)
+            light["flip_normals"] = flip
+            lights[f"{key}_{flip}"] = light
+    return {**stage(), **lights}
+
+
+def many_suns():
+    """More directional lights than take part one by one, an environment and point lights."""
+    generator = np.random.default_rng(11)
+    lights = {"sky": {"type": "constant", "radiance": rgb([0.1, 0.15, 0.2])}}
+    for index, colour in enumerate(colours(20, generator, 1.0)):
+        x, y = generator.uniform(-1, 1, 2)
+        lights[f"sun_{index}"] = {
+            "type": "directional",
+            "direction": [float(x), float(y), -1],
+            "irradiance": rgb(colour),
+        }
+    return {**stage(), **lights, **points(40, total=4.0)}
+
+
+def hard_spots():
+    """Spots without a transition, and with a beam that is wider than the cone."""
+    lights = spots(20, seed=12)
+    for index, light in enumerate(lights.values()):
+        light["beam_width"] = light["cutoff_angle"] * (1 if index % 2 else 1.5)
+    return {**stage(), **lights}
+
+
 def environment_map():
     """An environment map, a beam, point lights and rectangles."""
     y, x = np.mgrid[0:8, 0:16]
@@ -446,6 +481,9 @@ SCENES = {
     "projectors": projectors,
     "sky": sky,
     "environment-map": environment_map,
+    "mirrored": mirrored,
+    "many-suns": many_suns,
+    "hard-spots": hard_spots,
     "mixed": mixed,
     "visible-lights": visible_lights,
 }

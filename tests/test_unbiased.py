@@ -171,6 +171,15 @@ def test_mean_of_talk_method(llvm, name):
     assert_unbiased(name, llvm, ("exhaustive",), method="talk")
 
 
+@pytest.mark.parametrize("name", ["mirrored", "mesh-smooth", "hard-spots", "many-suns"])
+def test_light_samples_reach_all_light(llvm, name):
+    """Without BSDF samples nothing can make up for light that is never sampled."""
+    images = plugin_images(name, bsdf_samples=0)
+    kind = "bsdf" if name == "mesh-smooth" else "exhaustive"
+    reference = reference_images(name, kind, reference_variant(llvm))
+    tools.assert_same_mean(images, reference, label=f"{name}, {llvm}, light samples alone")
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("parameters", PARAMETERS, ids=parameter_id)
 def test_mean_does_not_depend_on_parameters(llvm, parameters, method):
