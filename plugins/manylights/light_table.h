@@ -424,10 +424,11 @@ private:
 
     static bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
                             ScalarPoint3f &high) {
-        auto box = emitter->bbox();
-        low      = box.min;
-        high     = box.max;
-        if (has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaPosition)) {
+        auto box   = emitter->bbox();
+        low        = box.min;
+        high       = box.max;
+        bool delta = has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaPosition);
+        if (!box.valid() && delta) { // projectors have no box, only a transformation
             auto position = emitter->world_transform().translation();
             for (int i = 0; i < 3; ++i)
                 low[i] = high[i] = read_scalar(position.entry(i));
