@@ -8,6 +8,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import pytest
+from manylights.loading import has_backend
 
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono_polarized")
 """Variants that the tests run in by default."""
@@ -17,9 +18,9 @@ def require_variant(name):
     """Skip the test if this machine cannot run the variant, else make it the current one."""
     if name not in mi.variants():
         pytest.skip(f"this Mitsuba has no variant {name}")
-    if name.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
-        pytest.skip(f"{name} needs the LLVM library (on Debian: apt install libllvm15)")
-    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+    if name.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
+        pytest.skip(f"{name} needs LLVM 17 or later (on Debian: apt install libllvm19)")
+    if name.startswith("cuda") and not has_backend(dr.JitBackend.CUDA):
         pytest.skip(f"{name} needs an NVIDIA driver and GPU")
     mi.set_variant(name)
 

@@ -16,6 +16,7 @@ import functools
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from manylights.loading import has_backend
 
 from tests import light_scenes
 from tests import statistics_tools as tools
@@ -40,7 +41,7 @@ LLVM_TWIN = {
 def reference_variant(variant):
     """The variant that renders the references of `variant`."""
     twin = LLVM_TWIN.get(variant, variant)
-    has_llvm = twin in mi.variants() and dr.has_backend(dr.JitBackend.LLVM)
+    has_llvm = twin in mi.variants() and has_backend(dr.JitBackend.LLVM)
     return twin if has_llvm else variant
 
 

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import __version__, loading, rendering
+from manylights.loading import has_backend
 from manylights.progress import Estimate, format_seconds
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -102,7 +103,7 @@ def test_render_writes_image_and_preview(scene, tmp_path):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_same_seed_gives_the_same_bytes(scene, tmp_path, variant):
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+    if variant.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
         pytest.skip("no libLLVM")
     images = []
     for index, (seed, threads) in enumerate([(5, 1), (5, 2), (6, 2)]):
@@ -255,7 +256,7 @@ def test_seeds_of_passes_differ_and_the_first_is_the_seed():
 
 def test_passes_give_the_mean_of_their_samples(monkeypatch):
     """Five passes are the mean of five renders, weighted by samples, in all channels."""
-    if not dr.has_backend(dr.JitBackend.LLVM):
+    if not has_backend(dr.JitBackend.LLVM):
         pytest.skip("no libLLVM")
     mi.set_variant("llvm_ad_rgb")
     monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", 0)
@@ -295,7 +296,7 @@ def test_times_are_readable(seconds, text):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_ctrl_c_leaves_no_file(tmp_path, variant):
-    if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+    if variant.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
         pytest.skip("no libLLVM")
     out = tmp_path / "out.exr"
     command = [sys.executable, "-m", "manylights", "render", SCENES / "points.xml", "-o", out]

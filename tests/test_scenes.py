@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import loading, scenes, tree
+from manylights.loading import has_backend
 from manylights.scenes import _build
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -21,7 +22,7 @@ COUNTED = [name for name in scenes.names() if name != "on_emitter"]
 
 @pytest.fixture(params=VARIANTS)
 def each_variant(request):
-    if request.param.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
+    if request.param.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
         pytest.skip("no libLLVM")
     mi.set_variant(request.param)
     return request.param

@@ -188,7 +188,7 @@ def _start(options) -> str:
     if options.variant:
         reason = "as asked for"
     else:
-        reason = "libLLVM found" if variant == "llvm_ad_rgb" else "no libLLVM found"
+        reason = "libLLVM found" if variant == "llvm_ad_rgb" else "no usable libLLVM found"
     _say(f"variant: {variant} ({reason})")
     return variant
 

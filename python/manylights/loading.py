@@ -22,9 +22,20 @@ class LoadedScene:
     notes: list[str]
 
 
+OLDEST_LLVM = 17
+"""Kernels of Dr.Jit 1.5 abort the process with an older LLVM on x86-64."""
+
+
+def has_backend(backend: dr.JitBackend) -> bool:
+    """Can kernels be compiled for this backend on this machine?"""
+    if not dr.has_backend(backend):
+        return False
+    return backend != dr.JitBackend.LLVM or int(dr.detail.llvm_version()[0]) >= OLDEST_LLVM
+
+
 def default_variant() -> str:
-    """Return ``llvm_ad_rgb`` where libLLVM is installed, else ``scalar_rgb``."""
-    has_llvm = "llvm_ad_rgb" in mi.variants() and dr.has_backend(dr.JitBackend.LLVM)
+    """Return ``llvm_ad_rgb`` where a usable libLLVM is installed, else ``scalar_rgb``."""
+    has_llvm = "llvm_ad_rgb" in mi.variants() and has_backend(dr.JitBackend.LLVM)
     return "llvm_ad_rgb" if has_llvm else "scalar_rgb"
 
 
@@ -37,12 +48,13 @@ def set_variant(name: str | None) -> str:
     variant = name or default_variant()
     if variant not in mi.variants():
         raise UsageError(f"--variant {variant}: unknown, choose from {', '.join(mi.variants())}")
-    for prefix, backend in (("llvm", dr.JitBackend.LLVM), ("cuda", dr.JitBackend.CUDA)):
-        if variant.startswith(prefix) and not dr.has_backend(backend):
-            raise UsageError(
-                f"--variant {variant}: this machine has no usable {prefix.upper()} library, "
-                "use a scalar variant or install it"
-            )
+    needs = (
+        ("llvm", dr.JitBackend.LLVM, f"LLVM {OLDEST_LLVM} or later (on Debian: libllvm19)"),
+        ("cuda", dr.JitBackend.CUDA, "an NVIDIA driver and GPU"),
+    )
+    for prefix, backend, what in needs:
+        if variant.startswith(prefix) and not has_backend(backend):
+            raise UsageError(f"--variant {variant}: needs {what}; a scalar variant does without")
     mi.set_variant(variant)
     return variant
 
