@@ -101,8 +101,10 @@ lights there are. **It works less well**
   the same with less arithmetic.
 
 Emitters of all kinds are supported. Point and spot lights and area lights on meshes, spheres,
-disks and cylinders are evaluated without virtual function calls, so 10,000 of them compile as
-fast as one; other emitters are sampled by their own plugins once they were selected.
+disks and cylinders are evaluated without virtual function calls, so that kernels do not grow
+with the number of lights; other emitters, and radiance that varies over a triangle, are
+evaluated by their own plugins once they were selected. Shapes on which Mitsuba cannot choose a
+point (curves) are found by BSDF sampling alone.
 
 .. note:: This integrator does not handle participating media or indirect illumination. In JIT
    variants it refuses to be recorded by :code:`dr.freeze`.
