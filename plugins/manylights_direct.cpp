@@ -169,12 +169,12 @@ public:
                                           sampler->next_1d(active),
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
-        auto shading = direct.prepare(si, bsdf, u, active);
+        auto vertex  = direct.prepare(si, bsdf, nullptr, u, active);
         Mask smooth  = active && has_flag(bsdf->flags(), BSDFFlags::Smooth);
         if (dr::any_or<true>(smooth))
-            result += direct.sample_lights(shading, smooth);
+            result += direct.sample_lights(vertex, smooth);
         if (direct.needs_bsdf_samples())
-            result += direct.sample_bsdf(shading, sampler, active);
+            result += direct.sample_bsdf(vertex, sampler, active);
         return { result, valid_ray };
     }
 
@@ -187,6 +187,7 @@ public:
         std::ostringstream oss;
         oss << "ManyLightsDirect[" << std::endl
             << "  " << string::indent(manylights::to_string(m_params)) << "," << std::endl
+            << "  bsdf_samples = " << m_params.bsdf_samples << "," << std::endl
             << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << ","
             << std::endl
             << "  tree = " << string::indent(m_cache.to_string()) << std::endl

@@ -28,7 +28,7 @@ using Choices = std::pair<std::vector<uint32_t>, std::vector<float>>;
 
 Receiver<float> receiver(const Place &p, const Place &n, bool transmits) {
     mitsuba::Vector<float, 3> normal(n(0), n(1), n(2));
-    return { { p(0), p(1), p(2) }, normal, normal, transmits, 1.f, 0.f, 1.f };
+    return { { p(0), p(1), p(2) }, normal, normal, transmits, 1.f, 0.f, 1.f, false, 0.f };
 }
 
 SplitFunction split_function(const std::string &name) {

@@ -21,21 +21,14 @@
  */
 
 #include "parameters.h"
-#include "receiver.h"
 #include "scene_emission.h"
+#include "vertex.h"
 #include <array>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/integrator.h>
 #include <mitsuba/render/sampler.h>
 
 namespace manylights {
-
-/// Random numbers of one shading point; the first two profit most from stratification
-template <typename Float> struct LightSample {
-    using Point2f = mitsuba::Point<Float, 2>;
-    Float tree, selection;
-    Point2f point;
-};
 
 /// weight_a of the balance heuristic, 0 where neither strategy can produce the sample
 template <typename Float> Float mis_weight(const Float &pdf_a, const Float &pdf_b) {
@@ -53,10 +46,13 @@ public:
     using Point2fD = mitsuba::Point<FloatD, 2>;
     using Rng      = dr::PCG32<UInt32D>;
     using Reader   = ReceiverReader<Float, Spectrum>;
+    using Media    = manylights::Media<Float, Spectrum>;
+    using Vertex   = manylights::Vertex<Float, Spectrum>;
 
     DirectLight(const Scene *scene, const Lights &lights,
-                const SamplingParameters &params)
-        : m_scene(scene), m_lights(lights), m_emission(scene, lights), m_params(params) {
+                const SamplingParameters &params, const MediaKinds &media = {})
+        : m_scene(scene), m_lights(lights), m_emission(scene, lights),
+          m_media(scene, media), m_params(params) {
         uint32_t count = lights.tree().light_count;
         // N <= m: no tree, every light is a candidate
         m_all      = count <= params.reservoirs || params.visits_all();
@@ -68,6 +64,11 @@ public:
     }
 
     const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
+    const Media &media() const { return m_media; }
+
+    /// Which random numbers are needed besides points on lights?
+    bool uses_tree() const { return !m_all; }
+    bool selects() const { return m_choose; }
 
     /// Can BSDF sampling find light at all?
     bool needs_bsdf_samples() const {
@@ -75,34 +76,27 @@ public:
                (m_lights.can_be_hit() || m_scene->environment() != nullptr);
     }
 
-    /// The shading point as BSDFs and as the tree want it, with its random numbers
-    struct Shading {
-        const SurfaceInteraction3f &si;
-        const BSDFPtr &bsdf;
-        LightSample<Float> u;
-        Receiver<FloatD> at;
-    };
-
-    Shading prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                    const LightSample<Float> &u, Mask active) const {
-        bool glossy = m_lights.tree().glossy && !m_all;
-        return { si, bsdf, u, Reader::read(si, bsdf, glossy, active) };
+    /// A vertex with its random numbers; `inside` is null in scenes without media
+    Vertex prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
+                   const typename Vertex::InMedium *inside, const LightSample<Float> &u,
+                   Mask active) const {
+        return { si, bsdf, inside, u, m_lights.glossy() && !m_all, active };
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
-    Spectrum sample_lights(const Shading &shading, Mask active) const {
+    Spectrum sample_lights(const Vertex &vertex, Mask active) const {
         if (m_items == 0)
             return Spectrum(0.f);
-        return trace_kept(shading, keep_lights(shading, active), active);
+        return trace_kept(vertex, keep_lights(vertex, active), active);
     }
 
     /// Radiance that arrives along rays sampled from the BSDF
-    Spectrum sample_bsdf(const Shading &shading, Sampler *sampler, Mask active) const {
-        const SurfaceInteraction3f &si = shading.si;
+    Spectrum sample_bsdf(const Vertex &vertex, Sampler *sampler, Mask active) const {
+        const SurfaceInteraction3f &si = vertex.si;
         mitsuba::BSDFContext ctx;
         Spectrum result(0.f);
         for (uint32_t i = 0; i < m_params.bsdf_samples; ++i) {
-            auto [bs, value] = shading.bsdf->sample(ctx, si, sampler->next_1d(active),
+            auto [bs, value] = vertex.bsdf->sample(ctx, si, sampler->next_1d(active),
                                                     sampler->next_2d(active), active);
             value            = si.to_world_mueller(value, -bs.wo, si.wi);
             Mask active_b =
@@ -113,10 +107,51 @@ public:
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
             Float light_pdf = dr::select(
-                delta, 0.f, hit_density(shading, hit, light, active_b && !delta));
+                delta, 0.f,
+                hit_density(vertex.at, vertex.u.tree, hit, light, active_b && !delta));
             Float pdf = bs.pdf * (float) m_params.bsdf_samples;
             result[active_b] += value * radiance * mis_weight<Float>(pdf, light_pdf) /
                                 (float) m_params.bsdf_samples;
+        }
+        return result;
+    }
+
+    /**
+     * Density with which \ref sample_lights chooses the direction that hit `light` or the
+     * environment, seen from the receiver of a vertex and for its random number of the tree
+     */
+    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree,
+                      const SurfaceInteraction3f &hit, const UInt32D &light,
+                      Mask active) const {
+        Interaction3f from(0.f, hit.time, hit.wavelengths, Point3f(at.p));
+        Float result(0.f);
+        Mask found = active && light < kOnlyHit;
+        if (m_lights.can_be_hit() && dr::any_or<true>(found)) {
+            dr::suspend_grad<Float> detached;
+            const auto &tree = m_lights.tree();
+            Row<FloatD> row  = tree.row(light, plain(found));
+            FloatD pdf       = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
+                return light_pdf<FloatD>(row, kind, at.p, plain(hit.p),
+                                         plain(Vector3f(hit.n)));
+            });
+            result           = Float(pdf);
+            if (tree.kinds.has(LightKind::Other)) {
+                Mask other = found && row.is(LightKind::Other);
+                if (dr::any_or<true>(other)) {
+                    DirectionSample3f ds(m_scene, hit, from);
+                    dr::masked(result, other) =
+                        m_emission.emitter_of(row)->pdf_direction(from, ds, other);
+                }
+            }
+            result *= Float(inclusion_probability(at, light, plain(u_tree), plain(found)));
+            result = dr::select(found, result, 0.f);
+        }
+        Mask missed = active && !hit.is_valid();
+        if (const Emitter *environment = m_scene->environment();
+            environment && dr::any_or<true>(missed)) {
+            DirectionSample3f ds(m_scene, hit, from);
+            dr::masked(result, missed) =
+                infinite_probability() * environment->pdf_direction(from, ds, missed);
         }
         return result;
     }
@@ -147,28 +182,26 @@ private:
     // --------------------------------------------------------------- Stages 1 and 2
 
     /// Choices are not differentiated: no gradient passes through here
-    Kept keep_lights(const Shading &shading, Mask active) const {
+    Kept keep_lights(const Vertex &vertex, Mask active) const {
         dr::suspend_grad<Float> detached;
-        LightSample<FloatD> u{ plain(shading.u.tree), plain(shading.u.selection),
-                               Point2fD(plain(shading.u.point.x()),
-                                        plain(shading.u.point.y())) };
+        LightSample<FloatD> u = plain_sample(vertex.u);
         if (m_all)
             return keep(
-                shading,
+                vertex,
                 AllLights<FloatD>{ UInt32D(0), dr::opaque<UInt32D>(light_count()) }, u,
                 active);
         if (m_params.method == Method::Talk)
-            return keep(shading, talk_cursor(u.tree), u, active);
+            return keep(vertex, talk_cursor(u.tree), u, active);
         FloatD expected = dr::opaque<FloatD>(m_params.expected_candidates());
-        return keep(shading, SystematicCursor<FloatD>(expected, u.tree), u, active);
+        return keep(vertex, SystematicCursor<FloatD>(expected, u.tree), u, active);
     }
 
     template <typename Cursor>
-    Kept keep(const Shading &shading, const Cursor &cursor, const LightSample<FloatD> &u,
+    Kept keep(const Vertex &vertex, const Cursor &cursor, const LightSample<FloatD> &u,
               Mask active) const {
-        return m_keep_all ? keep_candidates(shading, cursor, u, active)
-                          : keep_resampled(shading,
-                                           resample(shading.at, cursor, u, plain(active)),
+        return m_keep_all ? keep_candidates(vertex, cursor, u, active)
+                          : keep_resampled(vertex,
+                                           resample(vertex.at, cursor, u, plain(active)),
                                            active);
     }
 
@@ -181,7 +214,7 @@ private:
 
     /// No more candidates than slots: keep each with C = 1 / p
     template <typename Cursor>
-    Kept keep_candidates(const Shading &shading, const Cursor &cursor,
+    Kept keep_candidates(const Vertex &vertex, const Cursor &cursor,
                          const LightSample<FloatD> &u, Mask active) const {
         struct State {
             Cursor cursor;
@@ -198,7 +231,7 @@ private:
             state,
             [&](const State &s) { return on && s.cursor.has_next() && s.slot < m_slots; },
             [&](State &s) {
-                auto candidate = s.cursor.next(m_lights.tree(), shading.at, s.rng);
+                auto candidate = s.cursor.next(m_lights.tree(), vertex.at, s.rng);
                 FloatD p = candidate.probability, weight = dr::rcp(p);
                 MaskD valid = candidate.valid;
                 Kept &kept  = s.kept;
@@ -206,7 +239,7 @@ private:
                 write_slot<FloatD>(kept.weight, s.slot, weight, m_slots, valid);
                 write_slot<FloatD>(kept.probability, s.slot, p, m_slots, valid);
                 if (m_choose) {
-                    FloatD g = light_target(shading, candidate.light, p, s.slot,
+                    FloatD g = light_target(vertex, candidate.light, p, s.slot,
                                             active && valid);
                     write_slot<FloatD>(kept.target, s.slot, weight * g, m_items, valid);
                 }
@@ -236,8 +269,7 @@ private:
             state, [&](const State &s) { return active && s.cursor.has_next(); },
             [&](State &s) {
                 auto candidate = s.cursor.next(tree, at, s.rng);
-                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds,
-                                            tree.glossy);
+                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds);
                 s.reservoirs.add(candidate, h, m_slots, dealing, s.rng);
             },
             "Direct light: resampled candidates");
@@ -245,7 +277,7 @@ private:
     }
 
     /// C = W / H, and the targets
-    Kept keep_resampled(const Shading &shading, const Reservoirs<FloatD> &reservoirs,
+    Kept keep_resampled(const Vertex &vertex, const Reservoirs<FloatD> &reservoirs,
                         Mask active) const {
         struct State {
             UInt32D slot;
@@ -267,7 +299,7 @@ private:
             [&](State &s) {
                 FloatD weight = read_slot<FloatD>(kept.weight, s.slot, m_slots);
                 FloatD target =
-                    light_target(shading, read_slot<UInt32D>(kept.light, s.slot, m_slots),
+                    light_target(vertex, read_slot<UInt32D>(kept.light, s.slot, m_slots),
                                  read_slot<FloatD>(kept.probability, s.slot, m_slots),
                                  s.slot, active && weight > 0.f);
                 write_slot<FloatD>(s.target, s.slot, weight * target, m_items, true);
@@ -278,21 +310,26 @@ private:
         return kept;
     }
 
+    static LightSample<FloatD> plain_sample(const LightSample<Float> &u) {
+        return { plain(u.tree), plain(u.selection),
+                 Point2fD(plain(u.point.x()), plain(u.point.y())) };
+    }
+
     /// Numbers that need no stratification, seeded with the bits of those that have it
-    static Rng make_rng(const LightSample<FloatD> &u) {
+    static Rng make_rng(const LightSample<FloatD> &u, uint32_t stream = 1) {
         auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
         auto [a, b] =
             mitsuba::sample_tea_32(bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
                                    bits(u.point.y()) + bits(u.selection));
         using UInt64D = dr::uint64_array_t<UInt32D>;
-        return Rng(1, UInt64D(a) + dr::sl<32>(UInt64D(b)));
+        return Rng(stream, UInt64D(a) + dr::sl<32>(UInt64D(b)));
     }
 
     // ------------------------------------------------------------------------ Stage 3
 
-    Spectrum trace_kept(const Shading &shading, Kept kept, Mask active) const {
-        InfiniteSamples infinite = sample_infinite(shading, active);
-        FloatD offset            = plain(shading.u.selection);
+    Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
+        InfiniteSamples infinite = sample_infinite(vertex, active);
+        FloatD offset            = plain(vertex.u.selection);
         FloatD tau(0.f);
         if (m_choose) {
             for (size_t i = 0; i < infinite_items(); ++i)
@@ -303,9 +340,12 @@ private:
         struct State {
             UInt32D ray;
             Spectrum result;
-            DRJIT_STRUCT(State, ray, result)
+            Rng rng;
+            DRJIT_STRUCT(State, ray, result, rng)
         };
-        State state{ UInt32D(0), Spectrum(0.f) };
+        State state{ UInt32D(0), Spectrum(0.f), Rng() };
+        if (m_media.kinds().heterogeneous)
+            state.rng = make_rng(plain_sample(vertex.u), 2);
         uint32_t rays = std::min(m_params.shadow_rays, m_items);
         MaskD on      = plain(active);
         loop(
@@ -318,7 +358,8 @@ private:
                                                  (FloatD(s.ray) + offset) * tau);
                     boost  = dr::maximum(1.f, tau / chosen.target);
                 }
-                s.result += trace(shading, kept, infinite, chosen, active) * Float(boost);
+                s.result +=
+                    trace(vertex, kept, infinite, chosen, s.rng, active) * Float(boost);
                 s.ray += 1u;
             },
             "Direct light: shadow rays");
@@ -326,9 +367,9 @@ private:
     }
 
     /// The chosen item's contribution, with visibility
-    Spectrum trace(const Shading &shading, const Kept &kept,
+    Spectrum trace(const Vertex &vertex, const Kept &kept,
                    const InfiniteSamples &infinite, const Selected<FloatD> &chosen,
-                   Mask active) const {
+                   Rng &rng, Mask active) const {
         active &= chosen.valid;
         Sample sample = dr::zeros<Sample>();
         if (m_slots > 0) {
@@ -336,7 +377,7 @@ private:
             FloatD weight = read_slot<FloatD>(kept.weight, slot, m_slots);
             Mask finite   = active && chosen.item < m_slots && weight > 0.f;
             sample        = sample_light_point(
-                shading, read_slot<UInt32D>(kept.light, slot, m_slots),
+                vertex, read_slot<UInt32D>(kept.light, slot, m_slots),
                 read_slot<FloatD>(kept.probability, slot, m_slots), slot,
                 /* target_only = */ false, finite);
             sample.value = sample.value * Float(weight) & finite;
@@ -349,16 +390,31 @@ private:
             Mask(Reader::target(sample.value) > 0.f); // drops invalid values as well
         if (dr::none_or<false>(active))
             return Spectrum(0.f);
-        Mask occluded = m_scene->ray_test(shading.si.spawn_ray_to(sample.p), active);
-        return sample.value & (active && !occluded);
+        return visible(vertex, sample, rng, active);
+    }
+
+    /// What arrives of a sample: all or nothing without media
+    Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
+                     Mask active) const {
+        Ray3f ray = vertex.origin().spawn_ray_to(sample.p);
+        if (!vertex.inside) {
+            Mask occluded = m_scene->ray_test(ray, active);
+            return sample.value & (active && !occluded);
+        }
+        auto medium = m_media.medium_beyond(vertex.si, vertex.inside->medium, ray.d,
+                                            vertex.on_surface(active));
+        return sample.value * m_media.transmittance(ray, medium, rng, active) & active;
     }
 
     /// luminance(F) of a light's point
-    FloatD light_target(const Shading &shading, const UInt32D &light,
+    FloatD light_target(const Vertex &vertex, const UInt32D &light,
                         const FloatD &inclusion, const UInt32D &slot, Mask active) const {
-        return Reader::target(sample_light_point(shading, light, inclusion, slot,
-                                                 /* target_only = */ true, active)
-                                  .value);
+        Sample sample = sample_light_point(vertex, light, inclusion, slot,
+                                           /* target_only = */ true, active);
+        FloatD target = Reader::target(sample.value);
+        if (vertex.at.media)
+            target *= attenuation(vertex.at, dr::norm(plain(sample.p) - vertex.at.p));
+        return target;
     }
 
     /**
@@ -366,7 +422,7 @@ private:
      * sign if only the target is wanted: their H times a typical BSDF value. The plugin is
      * then called for the chosen lights only.
      */
-    Sample sample_light_point(const Shading &shading, const UInt32D &light,
+    Sample sample_light_point(const Vertex &vertex, const UInt32D &light,
                               const FloatD &inclusion, const UInt32D &slot,
                               bool target_only, Mask active) const {
         const auto &tree = m_lights.tree();
@@ -377,20 +433,20 @@ private:
         bool others = kinds.has(LightKind::Other);
         Mask other  = others ? Mask(row.is(LightKind::Other)) : Mask(false);
         Mask table  = active && !other;
-        Point2f u   = slot_point(shading.u.point, slot);
+        Point2f u   = slot_point(vertex.u.point, slot);
         if (dr::any_or<true>(table) && !kinds.only(LightKind::Other))
-            result = sample_row(shading, row, u, inclusion, target_only, table);
+            result = sample_row(vertex, row, u, inclusion, target_only, table);
         if (others) {
             other &= active;
             if (target_only) {
                 constexpr float typical_bsdf = .2f;
                 Float guess =
-                    Float(light_importance(shading.at, row, kinds, tree.glossy)) *
-                    (tree.glossy ? 1.f : typical_bsdf);
+                    Float(light_importance(vertex.at, row, kinds)) *
+                    (vertex.at.glossy ? 1.f : typical_bsdf);
                 dr::masked(result.value, other) =
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
             } else if (dr::any_or<true>(other)) {
-                Sample sample = sample_emitter(shading, m_emission.emitter_of(row), u,
+                Sample sample = sample_emitter(vertex, m_emission.emitter_of(row), u,
                                                Float(inclusion), other);
                 dr::masked(result, other) = sample;
             }
@@ -407,19 +463,19 @@ private:
     }
 
     /// A sample of a light of the table
-    Sample sample_row(const Shading &shading, const Row<FloatD> &row, const Point2f &u,
+    Sample sample_row(const Vertex &vertex, const Row<FloatD> &row, const Point2f &u,
                       const FloatD &inclusion, bool target_only, Mask active) const {
         using LightPointD = LightPoint<FloatD>;
         mitsuba::Point<FloatD, 2> ud(plain(u.x()), plain(u.y()));
         LightPointD point = by_kind<LightPointD>(row, table_kinds(), [&](LightKind kind) {
-            return sample_light<FloatD>(row, kind, shading.at.p, ud);
+            return sample_light<FloatD>(row, kind, vertex.at.p, ud);
         });
         active &= point.pdf > 0.f;
 
-        const SurfaceInteraction3f &si = shading.si;
-        Vector3f d                     = dr::normalize(Point3f(point.p) - si.p);
-        Spectrum emission              = mitsuba::depolarizer<Spectrum>(
-            m_emission.color(row, si.wavelengths) & Mask(row.tabulated()));
+        Interaction3f from = vertex.origin();
+        Vector3f d         = dr::normalize(Point3f(point.p) - from.p);
+        Spectrum emission  = mitsuba::depolarizer<Spectrum>(
+            m_emission.color(row, from.wavelengths) & Mask(row.tabulated()));
         if (m_lights.needs_emitter_eval()) {
             Mask eval = active && !row.tabulated();
             if (target_only)
@@ -427,13 +483,13 @@ private:
                     UnpolarizedSpectrum(Float(row[kLuminance])));
             else
                 m_emission.add_masked(emission, eval, [&](Mask m) {
-                    return m_emission.triangle_emission(si, row, point, d, m);
+                    return m_emission.triangle_emission(from, row, point, d, m);
                 });
         }
         bool delta_only = !m_lights.can_be_hit();
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
         Mask delta      = row.kind() <= (uint32_t) LightKind::Spot;
-        Spectrum f      = scatter(shading, d, light_pdf, delta, active);
+        Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
         return { f * emission * Float(point.weight) & active, Point3f(point.p) };
     }
 
@@ -441,28 +497,24 @@ private:
         return { m_lights.tree().kinds.bits & ~(1u << (uint32_t) LightKind::Other) };
     }
 
-    /// BSDF (with its cosine) times the MIS weight of the light side
-    Spectrum scatter(const Shading &shading, const Vector3f &d, const Float &light_pdf,
+    /// What the vertex scatters times the MIS weight of the light side
+    Spectrum scatter(const Vertex &vertex, const Vector3f &d, const Float &light_pdf,
                      const Mask &delta, Mask active) const {
-        mitsuba::BSDFContext ctx;
-        const SurfaceInteraction3f &si = shading.si;
-        Vector3f wo                    = si.to_local(d);
-        if (!needs_bsdf_samples())
-            return si.to_world_mueller(shading.bsdf->eval(ctx, si, wo, active), -wo,
-                                       si.wi);
-        auto [value, pdf] = shading.bsdf->eval_pdf(ctx, si, wo, active);
-        value             = si.to_world_mueller(value, -wo, si.wi);
+        bool mis          = needs_bsdf_samples();
+        auto [value, pdf] = vertex.eval_pdf(d, mis, active);
+        if (!mis)
+            return value;
         Float weight = mis_weight<Float>(light_pdf, pdf * (float) m_params.bsdf_samples);
         return value * dr::detach(dr::select(delta, 1.f, weight));
     }
 
     /// A sample from the emitter's own plugin
     template <typename Ptr>
-    Sample sample_emitter(const Shading &shading, const Ptr &emitter, const Point2f &u,
+    Sample sample_emitter(const Vertex &vertex, const Ptr &emitter, const Point2f &u,
                           const Float &inclusion, Mask active) const {
-        auto [ds, weight] = emitter->sample_direction(shading.si, u, active);
+        auto [ds, weight] = emitter->sample_direction(vertex.origin(), u, active);
         active &= ds.pdf != 0.f;
-        Spectrum f = scatter(shading, ds.d, inclusion * ds.pdf, ds.delta, active);
+        Spectrum f = scatter(vertex, ds.d, inclusion * ds.pdf, ds.delta, active);
         return { f * weight & active, ds.p };
     }
 
@@ -478,13 +530,13 @@ private:
         return count <= kMaxInfinite ? 1.f : 1.f / count;
     }
 
-    InfiniteSamples sample_infinite(const Shading &shading, Mask active) const {
+    InfiniteSamples sample_infinite(const Vertex &vertex, Mask active) const {
         InfiniteSamples samples;
         float p = infinite_probability();
         for (uint32_t i = 0; i < infinite_items(); ++i) {
-            Point2f u = slot_point(shading.u.point, UInt32D(m_slots + i));
+            Point2f u = slot_point(vertex.u.point, UInt32D(m_slots + i));
             if (p == 1.f) {
-                samples[i] = sample_emitter(shading, m_lights.infinite()[i], u,
+                samples[i] = sample_emitter(vertex, m_lights.infinite()[i], u,
                                             Float(1.f), active);
                 continue;
             }
@@ -494,50 +546,10 @@ private:
             u.x()          = u.x() * (float) count - Float(index);
             EmitterPtr emitter =
                 dr::gather<EmitterPtr>(m_lights.infinite_dr(), index, active);
-            samples[i] = sample_emitter(shading, emitter, u, Float(p), active);
+            samples[i] = sample_emitter(vertex, emitter, u, Float(p), active);
             samples[i].value *= (float) count;
         }
         return samples;
-    }
-
-    // ------------------------------------------------------------------------- Density
-
-    /// Density of the light side for the direction that hit `light` or the environment
-    Float hit_density(const Shading &shading, const SurfaceInteraction3f &hit,
-                      const UInt32D &light, Mask active) const {
-        const SurfaceInteraction3f &si = shading.si;
-        const Receiver<FloatD> &at     = shading.at;
-        Float result(0.f);
-        Mask found = active && light < kOnlyHit;
-        if (m_lights.can_be_hit() && dr::any_or<true>(found)) {
-            dr::suspend_grad<Float> detached;
-            const auto &tree = m_lights.tree();
-            Row<FloatD> row  = tree.row(light, plain(found));
-            FloatD pdf       = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
-                return light_pdf<FloatD>(row, kind, at.p, plain(hit.p),
-                                         plain(Vector3f(hit.n)));
-            });
-            result           = Float(pdf);
-            if (tree.kinds.has(LightKind::Other)) {
-                Mask other = found && row.is(LightKind::Other);
-                if (dr::any_or<true>(other)) {
-                    DirectionSample3f ds(m_scene, hit, si);
-                    dr::masked(result, other) =
-                        m_emission.emitter_of(row)->pdf_direction(si, ds, other);
-                }
-            }
-            result *= Float(
-                inclusion_probability(at, light, plain(shading.u.tree), plain(found)));
-            result = dr::select(found, result, 0.f);
-        }
-        Mask missed = active && !hit.is_valid();
-        if (const Emitter *environment = m_scene->environment();
-            environment && dr::any_or<true>(missed)) {
-            DirectionSample3f ds(m_scene, hit, si);
-            dr::masked(result, missed) =
-                infinite_probability() * environment->pdf_direction(si, ds, missed);
-        }
-        return result;
     }
 
     /// Probability that `light` is a candidate at this shading point
@@ -555,6 +567,7 @@ private:
     const Scene *m_scene;
     const Lights &m_lights;
     SceneEmission<Float, Spectrum> m_emission;
+    Media m_media;
     const SamplingParameters &m_params;
     /// Is every light a candidate? Is every candidate kept? Are there more than shadow rays?
     bool m_all, m_keep_all, m_choose;

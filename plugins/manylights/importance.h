@@ -30,12 +30,28 @@ template <typename Float> struct Receiver {
     Vector3f n, wi;
     /// Can light arrive from behind as well?
     Mask transmits;
-    /// Reflectance off the lobe, peak of the lobe times alpha^2, and alpha^2 (GGX); used
-    /// only in scenes with glossy surfaces
+    /// Reflectance off the lobe, peak of the lobe times alpha^2, and alpha^2 (GGX)
     Float diffuse, specular, alpha2;
+    /// Is this a point in a medium, without a cosine? Its extinction, where that is constant
+    Mask in_medium;
+    Float extinction;
 
-    DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2)
+    DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, in_medium,
+                 extinction)
+
+    /// Which of the above are in use, the same for all receivers of a rendering: the lobe
+    /// and the medium. What is not costs nothing.
+    bool glossy = false, media = false;
 };
+
+/// Smallest transmittance that is assumed: how far the medium extends is not known
+constexpr float kTransmittanceFloor = .02f;
+
+/// exp(-extinction * distance), the largest plausible effect of a medium up to a light
+template <typename Float, typename Value>
+Value attenuation(const Receiver<Float> &at, const Value &distance) {
+    return dr::maximum(dr::exp(-distance * at.extinction), kTransmittanceFloor);
+}
 
 /**
  * Reflectance of the measured lobe towards the direction w / |w|, widened by the angle that
@@ -75,12 +91,13 @@ constexpr float kCosineRounding = 1e-6f;
  *     o = -a.w / e                                              a: mean emission axis
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
- * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1;
- * with `glossy` surfaces in the scene h is multiplied with the receiver's \ref lobe.
+ * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1.
+ * In scenes with glossy surfaces h is multiplied with the receiver's \ref lobe. In a medium
+ * there is no cosine, and h has the \ref attenuation.
  */
 template <typename Float>
 Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,
-                               bool oriented, bool glossy) {
+                               bool oriented) {
     using F4 = Four<Float>;
     F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
     F4 e2 = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
@@ -91,8 +108,12 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
     F4 cosine =
         .5f * (t + dr::sqrt(dr::fmadd(t, t, dr::fmadd(kCosineRounding, e2, c.variance))));
 
-    F4 importance = c.flux * ie2 * cosine * ie;
-    if (glossy) {
+    F4 projected = cosine * ie;
+    if (at.media)
+        projected = dr::select(at.in_medium, F4(1.f), projected) *
+                    attenuation(at, F4(e2 * ie));
+    F4 importance = c.flux * ie2 * projected;
+    if (at.glossy) {
         F4 dot_wi =
             dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
         importance *= lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2));
@@ -232,16 +253,17 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
  * outside of a spot's cone.
  */
 template <typename Float>
-Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds,
-                       bool glossy) {
+Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds) {
     Appearance<Float> a = by_kind<Appearance<Float>>(
         row, kinds, [&](LightKind kind) { return appearance(at, row, kind); });
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
     Float t      = dr::dot(at.n, a.w);
     t            = dr::select(at.transmits, dr::abs(t), t);
     Float cosine = .5f * (t + dr::sqrt(t * t + a.variance)) * inv_d;
+    if (at.media)
+        cosine = dr::select(at.in_medium, 1.f, cosine) * attenuation(at, Float(d2 * inv_d));
     Float reflectance(1.f);
-    if (glossy)
+    if (at.glossy)
         reflectance =
             lobe(at, Float(dr::dot(at.n, a.w) * inv_d),
                  Float(dr::dot(at.wi, a.w) * inv_d), Float(a.variance * inv_d * inv_d));

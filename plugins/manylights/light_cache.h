@@ -14,6 +14,7 @@
 #include "scene_lights.h"
 #include <atomic>
 #include <mitsuba/core/logger.h>
+#include <mitsuba/core/util.h>
 #include <mitsuba/render/sampler.h>
 #include <mutex>
 #include <sstream>

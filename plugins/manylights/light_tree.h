@@ -31,8 +31,8 @@ template <typename Float> struct TreeView {
     Storage nodes, binary, rows;
     uint32_t light_count = 0;
     KindSet kinds;
-    /// Does any light have a direction of emission, any surface a glossy lobe?
-    bool oriented = false, glossy = false;
+    /// Does any light have a direction of emission?
+    bool oriented = false;
 
     /// Gather the `Count` floats of entry `index`
     template <size_t Count>
@@ -107,7 +107,7 @@ template <typename Float>
 dr::Array<Float, 4> child_probabilities(const TreeView<Float> &tree,
                                         const Receiver<Float> &at,
                                         const Clusters<Float> &clusters) {
-    Four<Float> h  = cluster_importance(at, clusters, tree.oriented, tree.glossy);
+    Four<Float> h  = cluster_importance(at, clusters, tree.oriented);
     Float sum_h    = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     Float sum_flux = (clusters.flux.entry(0) + clusters.flux.entry(1)) +
                      (clusters.flux.entry(2) + clusters.flux.entry(3));

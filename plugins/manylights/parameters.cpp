@@ -56,20 +56,25 @@ const std::vector<std::string> kSplitFunctions = { "near", "far" };
 
 } // namespace
 
-SamplingParameters read_parameters(const Properties &props) {
+SamplingParameters read_path_parameters(const Properties &props) {
     SamplingParameters p;
     p.method         = (Method) read_choice(props, "method", kMethods);
     p.splitting_rate = read_rate(props, p.splitting_rate);
     p.reservoirs     = read_count(props, "reservoirs", p.reservoirs, 1, kMaxReservoirs);
     p.shadow_rays    = read_count(props, "shadow_rays",
                                   std::min(p.shadow_rays, p.reservoirs), 1, p.reservoirs);
-    p.bsdf_samples   = read_count(props, "bsdf_samples", p.bsdf_samples, 0, 1024);
     p.split_function =
         (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
     if (props.has_property("split_function") && p.method != Method::Talk)
         refuse(props, "split_function",
                "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
                "left out unless \"method\" is \"talk\"");
+    return p;
+}
+
+SamplingParameters read_parameters(const Properties &props) {
+    SamplingParameters p = read_path_parameters(props);
+    p.bsdf_samples       = read_count(props, "bsdf_samples", p.bsdf_samples, 0, 1024);
     return p;
 }
 
@@ -80,8 +85,7 @@ std::string to_string(const SamplingParameters &p) {
         oss << "split_function = " << kSplitFunctions[(size_t) p.split_function] << ",\n";
     oss << "splitting_rate = " << p.splitting_rate << ",\n"
         << "reservoirs = " << p.reservoirs << ",\n"
-        << "shadow_rays = " << p.shadow_rays << ",\n"
-        << "bsdf_samples = " << p.bsdf_samples;
+        << "shadow_rays = " << p.shadow_rays;
     return oss.str();
 }
 

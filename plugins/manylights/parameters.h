@@ -37,6 +37,9 @@ struct SamplingParameters {
 /// Read and check the parameters; throws with the name, the value and what is allowed
 SamplingParameters read_parameters(const mitsuba::Properties &props);
 
+/// The same for paths, where one direction is sampled at each vertex (no `bsdf_samples`)
+SamplingParameters read_path_parameters(const mitsuba::Properties &props);
+
 /// "name = value" lines
 std::string to_string(const SamplingParameters &params);
 

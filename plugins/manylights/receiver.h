@@ -8,12 +8,13 @@
 #include "importance.h"
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/interaction.h>
+#include <mitsuba/render/medium.h>
 
 namespace manylights {
 
 template <typename Float, typename Spectrum> class ReceiverReader {
 public:
-    MI_IMPORT_TYPES(BSDFPtr)
+    MI_IMPORT_TYPES(BSDFPtr, MediumPtr)
     using FloatD = dr::detached_t<Float>;
 
     /// Positive wherever the value is not zero; invalid values are never chosen
@@ -34,12 +35,29 @@ public:
                                  bool glossy, Mask active) {
         Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
         Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
-        Receiver<FloatD> at{ plain(si.p),      plain(n),    plain(si.to_world(si.wi)),
-                             plain(transmits), FloatD(1.f), FloatD(0.f),
-                             FloatD(1.f) };
+        Receiver<FloatD> at = dr::zeros<Receiver<FloatD>>();
+        at.p         = plain(si.p);
+        at.n         = plain(n);
+        at.wi        = plain(si.to_world(si.wi));
+        at.transmits = plain(transmits);
         if (glossy)
             measure_lobe(si, bsdf, at, active);
         return at;
+    }
+
+    /// The medium around a surface, or a point in the medium: no cosine, no lobe
+    static void add_medium(Receiver<FloatD> &at, const MediumInteraction3f &mei,
+                           const MediumPtr &medium, const Mask &scattered, Mask active) {
+        active &= medium != nullptr;
+        if (dr::any_or<true>(active))
+            active &= medium->is_homogeneous();
+        FloatD extinction = plain(dr::mean(mei.combined_extinction));
+        at.extinction     = dr::select(plain(active), extinction, 0.f);
+        at.in_medium      = plain(scattered);
+        dr::masked(at.p, at.in_medium)        = plain(mei.p);
+        dr::masked(at.n, at.in_medium)        = 0.f;
+        dr::masked(at.diffuse, at.in_medium)  = 1.f;
+        dr::masked(at.specular, at.in_medium) = 0.f;
     }
 
 private:

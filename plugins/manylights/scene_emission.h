@@ -76,7 +76,7 @@ public:
     }
 
     /// Radiance of a triangle whose emission varies, from its emitter
-    Spectrum triangle_emission(const SurfaceInteraction3f &from, const Row<FloatD> &row,
+    Spectrum triangle_emission(const Interaction3f &from, const Row<FloatD> &row,
                                const LightPoint<FloatD> &point, const Vector3f &d,
                                Mask active) const {
         EmitterPtr emitter           = emitter_of(row);

@@ -7,6 +7,7 @@
 
 #include "emission.h"
 #include "light_table.h"
+#include "media.h"
 #include <chrono>
 #include <drjit/tensor.h>
 #include <mitsuba/render/bsdf.h>
@@ -154,8 +155,9 @@ public:
             m_tree.oriented |=
                 bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0;
         for (const auto &shape : scene->shapes())
-            m_tree.glossy |= shape->bsdf() &&
-                             has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy);
+            m_glossy |= shape->bsdf() &&
+                        has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy);
+        m_media            = Media<Float, Spectrum>::find(scene);
         m_tree.light_count = (uint32_t) rows.size();
         m_tree.nodes =
             upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
@@ -194,6 +196,10 @@ public:
     }
 
     const Tree &tree() const { return m_tree; }
+    /// Has any surface a glossy lobe?
+    bool glossy() const { return m_glossy; }
+    /// Media of the shapes and sensors
+    const MediaKinds &media() const { return m_media; }
     const std::vector<const Emitter *> &infinite() const { return m_infinite; }
     /// The same as a buffer for kernels
     const mitsuba::DynamicBuffer<EmitterPtr> &infinite_dr() const {
@@ -280,7 +286,8 @@ private:
     std::unordered_map<const Shape *, ShapeLights<Shape>> m_shape_map;
     std::vector<const Emitter *> m_infinite;
     mitsuba::DynamicBuffer<EmitterPtr> m_infinite_dr;
-    bool m_needs_emitter_eval = false, m_can_be_hit = false;
+    bool m_needs_emitter_eval = false, m_can_be_hit = false, m_glossy = false;
+    MediaKinds m_media;
     Statistics m_statistics;
 };
 
