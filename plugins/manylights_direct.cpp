@@ -169,7 +169,7 @@ public:
                                           sampler->next_1d(active),
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
-        auto vertex  = direct.prepare(si, bsdf, nullptr, u, active);
+        auto vertex  = direct.prepare(si, bsdf, nullptr, u, true, active);
         Mask smooth  = active && has_flag(bsdf->flags(), BSDFFlags::Smooth);
         if (dr::any_or<true>(smooth))
             result += direct.sample_lights(vertex, smooth);

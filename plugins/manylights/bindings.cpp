@@ -28,7 +28,17 @@ using Choices = std::pair<std::vector<uint32_t>, std::vector<float>>;
 
 Receiver<float> receiver(const Place &p, const Place &n, bool transmits) {
     mitsuba::Vector<float, 3> normal(n(0), n(1), n(2));
-    return { { p(0), p(1), p(2) }, normal, normal, transmits, 1.f, 0.f, 1.f, false, 0.f };
+    return { { p(0), p(1), p(2) },
+             normal,
+             normal,
+             transmits,
+             1.f,
+             0.f,
+             1.f,
+             false,
+             0.f,
+             0.f,
+             0.f };
 }
 
 SplitFunction split_function(const std::string &name) {
@@ -160,7 +170,7 @@ Choices select_items(const Numbers &targets, uint32_t picks, float offset) {
     Slots<float> slots = make_slots<float>(count, 0.f);
     for (size_t i = 0; i < count; ++i)
         slots[i] = targets(i);
-    float tau = selection_threshold<float>(slots, count, picks);
+    float tau = selection_threshold<float>(slots, count, picks, (float) picks);
     Choices result;
     for (uint32_t i = 0; i < picks; ++i) {
         auto chosen = select_item<float>(slots, count, tau, (i + offset) * tau);

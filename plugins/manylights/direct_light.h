@@ -60,7 +60,7 @@ public:
         m_keep_all = most <= (float) params.reservoirs;
         m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
         m_items    = m_slots + infinite_items();
-        m_choose   = m_items > params.shadow_rays;
+        m_choose   = m_items > std::min(params.shadow_rays, params.deeper_rays);
     }
 
     const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
@@ -79,8 +79,15 @@ public:
     /// A vertex with its random numbers; `inside` is null in scenes without media
     Vertex prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
                    const typename Vertex::InMedium *inside, const LightSample<Float> &u,
-                   Mask active) const {
-        return { si, bsdf, inside, u, m_lights.glossy() && !m_all, active };
+                   const MaskD &first, Mask active) const {
+        return { si,
+                 bsdf,
+                 inside,
+                 u,
+                 effort(first),
+                 m_lights.glossy() && !m_all,
+                 m_params.segments,
+                 active };
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
@@ -97,7 +104,7 @@ public:
         Spectrum result(0.f);
         for (uint32_t i = 0; i < m_params.bsdf_samples; ++i) {
             auto [bs, value] = vertex.bsdf->sample(ctx, si, sampler->next_1d(active),
-                                                    sampler->next_2d(active), active);
+                                                   sampler->next_2d(active), active);
             value            = si.to_world_mueller(value, -bs.wo, si.wi);
             Mask active_b =
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
@@ -106,10 +113,10 @@ public:
             auto [radiance, light] = m_emission.emitted(hit, active_b);
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
-            Float light_pdf = dr::select(
-                delta, 0.f,
-                hit_density(vertex.at, vertex.u.tree, hit, light, active_b && !delta));
-            Float pdf = bs.pdf * (float) m_params.bsdf_samples;
+            Float light_pdf = dr::select(delta, 0.f,
+                                         hit_density(vertex.at, vertex.u.tree, true, hit,
+                                                     light, active_b && !delta));
+            Float pdf       = bs.pdf * (float) m_params.bsdf_samples;
             result[active_b] += value * radiance * mis_weight<Float>(pdf, light_pdf) /
                                 (float) m_params.bsdf_samples;
         }
@@ -120,10 +127,13 @@ public:
      * Density with which \ref sample_lights chooses the direction that hit `light` or the
      * environment, seen from the receiver of a vertex and for its random number of the tree
      */
-    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree,
+    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree, const MaskD &first,
                       const SurfaceInteraction3f &hit, const UInt32D &light,
                       Mask active) const {
-        Interaction3f from(0.f, hit.time, hit.wavelengths, Point3f(at.p));
+        auto p = at.p;
+        if (at.segments)
+            p -= at.distance * at.wi;
+        Interaction3f from(0.f, hit.time, hit.wavelengths, Point3f(p));
         Float result(0.f);
         Mask found = active && light < kOnlyHit;
         if (m_lights.can_be_hit() && dr::any_or<true>(found)) {
@@ -131,7 +141,7 @@ public:
             const auto &tree = m_lights.tree();
             Row<FloatD> row  = tree.row(light, plain(found));
             FloatD pdf       = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
-                return light_pdf<FloatD>(row, kind, at.p, plain(hit.p),
+                return light_pdf<FloatD>(row, kind, p, plain(hit.p),
                                          plain(Vector3f(hit.n)));
             });
             result           = Float(pdf);
@@ -143,7 +153,11 @@ public:
                         m_emission.emitter_of(row)->pdf_direction(from, ds, other);
                 }
             }
-            result *= Float(inclusion_probability(at, light, plain(u_tree), plain(found)));
+            if (at.segments)
+                result *= Float(dr::select(at.length > 0.f,
+                                           distances(at, row).pdf(at.distance), 1.f));
+            result *= Float(
+                inclusion_probability(at, light, plain(u_tree), first, plain(found)));
             result = dr::select(found, result, 0.f);
         }
         Mask missed = active && !hit.is_valid();
@@ -152,6 +166,9 @@ public:
             DirectionSample3f ds(m_scene, hit, from);
             dr::masked(result, missed) =
                 infinite_probability() * environment->pdf_direction(from, ds, missed);
+            if (at.segments)
+                dr::masked(result, missed && Mask(at.length > 0.f)) =
+                    result * Float(Distances::transmittance_pdf(at, at.distance));
         }
         return result;
     }
@@ -161,7 +178,9 @@ private:
     struct Sample {
         Spectrum value;
         Point3f p;
-        DRJIT_STRUCT(Sample, value, p)
+        /// Where the ray starts, if that is a choice of the sample (segments)
+        Point3f from;
+        DRJIT_STRUCT(Sample, value, p, from)
     };
     using InfiniteSamples = std::array<Sample, kMaxInfinite>;
 
@@ -192,17 +211,17 @@ private:
                 active);
         if (m_params.method == Method::Talk)
             return keep(vertex, talk_cursor(u.tree), u, active);
-        FloatD expected = dr::opaque<FloatD>(m_params.expected_candidates());
-        return keep(vertex, SystematicCursor<FloatD>(expected, u.tree), u, active);
+        return keep(vertex, SystematicCursor<FloatD>(vertex.effort.candidates, u.tree), u,
+                    active);
     }
 
     template <typename Cursor>
     Kept keep(const Vertex &vertex, const Cursor &cursor, const LightSample<FloatD> &u,
               Mask active) const {
-        return m_keep_all ? keep_candidates(vertex, cursor, u, active)
-                          : keep_resampled(vertex,
-                                           resample(vertex.at, cursor, u, plain(active)),
-                                           active);
+        return m_keep_all
+                   ? keep_candidates(vertex, cursor, u, active)
+                   : keep_resampled(vertex, resample(vertex.at, cursor, u, plain(active)),
+                                    active);
     }
 
     uint32_t light_count() const { return m_lights.tree().light_count; }
@@ -239,8 +258,8 @@ private:
                 write_slot<FloatD>(kept.weight, s.slot, weight, m_slots, valid);
                 write_slot<FloatD>(kept.probability, s.slot, p, m_slots, valid);
                 if (m_choose) {
-                    FloatD g = light_target(vertex, candidate.light, p, s.slot,
-                                            active && valid);
+                    FloatD g =
+                        light_target(vertex, candidate.light, p, s.slot, active && valid);
                     write_slot<FloatD>(kept.target, s.slot, weight * g, m_items, valid);
                 }
                 s.slot += dr::select(valid, UInt32D(1), UInt32D(0));
@@ -316,13 +335,13 @@ private:
     }
 
     /// Numbers that need no stratification, seeded with the bits of those that have it
-    static Rng make_rng(const LightSample<FloatD> &u, uint32_t stream = 1) {
+    static Rng make_rng(const LightSample<FloatD> &u, uint64_t stream = 1) {
         auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
         auto [a, b] =
             mitsuba::sample_tea_32(bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
                                    bits(u.point.y()) + bits(u.selection));
         using UInt64D = dr::uint64_array_t<UInt32D>;
-        return Rng(stream, UInt64D(a) + dr::sl<32>(UInt64D(b)));
+        return Rng(1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(stream));
     }
 
     // ------------------------------------------------------------------------ Stage 3
@@ -334,7 +353,8 @@ private:
         if (m_choose) {
             for (size_t i = 0; i < infinite_items(); ++i)
                 kept.target[m_slots + i] = Reader::target(infinite[i].value);
-            tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays);
+            tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays,
+                                              FloatD(vertex.effort.shadow_rays));
         }
 
         struct State {
@@ -346,8 +366,8 @@ private:
         State state{ UInt32D(0), Spectrum(0.f), Rng() };
         if (m_media.kinds().heterogeneous)
             state.rng = make_rng(plain_sample(vertex.u), 2);
-        uint32_t rays = std::min(m_params.shadow_rays, m_items);
-        MaskD on      = plain(active);
+        UInt32D rays = dr::minimum(vertex.effort.shadow_rays, m_items);
+        MaskD on     = plain(active);
         loop(
             state, [&](const State &s) { return on && s.ray < rays; },
             [&](State &s) {
@@ -396,7 +416,10 @@ private:
     /// What arrives of a sample: all or nothing without media
     Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
                      Mask active) const {
-        Ray3f ray = vertex.origin().spawn_ray_to(sample.p);
+        Interaction3f origin = vertex.origin();
+        if (vertex.at.segments)
+            origin.p = dr::select(Mask(vertex.at.length > 0.f), sample.from, origin.p);
+        Ray3f ray = origin.spawn_ray_to(sample.p);
         if (!vertex.inside) {
             Mask occluded = m_scene->ray_test(ray, active);
             return sample.value & (active && !occluded);
@@ -412,9 +435,58 @@ private:
         Sample sample = sample_light_point(vertex, light, inclusion, slot,
                                            /* target_only = */ true, active);
         FloatD target = Reader::target(sample.value);
-        if (vertex.at.media)
-            target *= attenuation(vertex.at, dr::norm(plain(sample.p) - vertex.at.p));
+        if (vertex.at.media) {
+            auto from =
+                dr::select(vertex.at.length > 0.f, plain(sample.from), vertex.at.p);
+            target *= attenuation(vertex.at, dr::norm(plain(sample.p) - from));
+        }
         return target;
+    }
+
+    using Distances = typename Vertex::Distances;
+
+    /// Distances along a segment for a light of the table
+    Distances distances(const Receiver<FloatD> &at, const Row<FloatD> &row) const {
+        using Look = Appearance<FloatD>;
+        Look light = by_kind<Look>(row, m_lights.tree().kinds, [&](LightKind kind) {
+            return appearance(at, row, kind);
+        });
+        return { at, light.w, light.variance };
+    }
+
+    /**
+     * f(vertex), a sample of a light. For a segment the vertex is moved to the distance t,
+     * of density pdf, and the sample has the factor sigma_s exp(-sigma_t t) / pdf (for the
+     * target, sigma_t in place of sigma_s).
+     */
+    template <typename F>
+    Sample at_distance(const Vertex &vertex, const FloatD &t, const FloatD &pdf,
+                       bool target_only, Mask active, const F &f) const {
+        Mask segment                    = active && Mask(vertex.at.length > 0.f);
+        typename Vertex::InMedium here  = *vertex.inside;
+        dr::masked(here.mei.p, segment) = here.start - Float(t) * here.mei.wi;
+        Vertex moved(vertex);
+        moved.inside                           = &here;
+        dr::masked(moved.at.p, plain(segment)) = plain(here.mei.p);
+        moved.at.segments                      = false;
+
+        UnpolarizedSpectrum sigma = here.mei.combined_extinction,
+                            tr    = dr::exp(-Float(t) * sigma);
+        Float density             = dr::detach(Media::channel_mean(tr * sigma));
+        moved.flight_ratio        = dr::select(segment, density / Float(pdf), 1.f);
+        if (!target_only && dr::any_or<true>(segment))
+            sigma =
+                std::get<0>(here.medium->get_scattering_coefficients(here.mei, segment));
+        Sample sample                     = f(moved);
+        dr::masked(sample.value, segment) = sample.value * (tr * sigma / Float(pdf));
+        sample.from                       = here.mei.p;
+        return sample;
+    }
+
+    /// Each slot gets its own shift of the number that the distance is chosen with
+    static FloatD slot_distance(const Vertex &vertex, const UInt32D &slot) {
+        FloatD shifted = dr::fmadd(FloatD(slot), .6180340f, plain(vertex.u.distance));
+        return shifted - dr::floor(shifted);
     }
 
     /**
@@ -425,10 +497,22 @@ private:
     Sample sample_light_point(const Vertex &vertex, const UInt32D &light,
                               const FloatD &inclusion, const UInt32D &slot,
                               bool target_only, Mask active) const {
-        const auto &tree = m_lights.tree();
-        Row<FloatD> row  = tree.row(light, plain(active));
-        KindSet kinds    = tree.kinds;
-        Sample result    = dr::zeros<Sample>();
+        Row<FloatD> row = m_lights.tree().row(light, plain(active));
+        auto sample     = [&](const Vertex &v) {
+            return sample_row_point(v, row, inclusion, slot, target_only, active);
+        };
+        if (!vertex.at.segments)
+            return sample(vertex);
+        Distances along = distances(vertex.at, row);
+        FloatD t        = along.sample(slot_distance(vertex, slot));
+        return at_distance(vertex, t, along.pdf(t), target_only, active, sample);
+    }
+
+    Sample sample_row_point(const Vertex &vertex, const Row<FloatD> &row,
+                            const FloatD &inclusion, const UInt32D &slot,
+                            bool target_only, Mask active) const {
+        KindSet kinds = m_lights.tree().kinds;
+        Sample result = dr::zeros<Sample>();
 
         bool others = kinds.has(LightKind::Other);
         Mask other  = others ? Mask(row.is(LightKind::Other)) : Mask(false);
@@ -440,9 +524,8 @@ private:
             other &= active;
             if (target_only) {
                 constexpr float typical_bsdf = .2f;
-                Float guess =
-                    Float(light_importance(vertex.at, row, kinds)) *
-                    (vertex.at.glossy ? 1.f : typical_bsdf);
+                Float guess = Float(light_importance(vertex.at, row, kinds)) *
+                              (vertex.at.glossy ? 1.f : typical_bsdf);
                 dr::masked(result.value, other) =
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
             } else if (dr::any_or<true>(other)) {
@@ -490,7 +573,7 @@ private:
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
         Mask delta      = row.kind() <= (uint32_t) LightKind::Spot;
         Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
-        return { f * emission * Float(point.weight) & active, Point3f(point.p) };
+        return { f * emission * Float(point.weight) & active, Point3f(point.p), from.p };
     }
 
     KindSet table_kinds() const {
@@ -515,7 +598,7 @@ private:
         auto [ds, weight] = emitter->sample_direction(vertex.origin(), u, active);
         active &= ds.pdf != 0.f;
         Spectrum f = scatter(vertex, ds.d, inclusion * ds.pdf, ds.delta, active);
-        return { f * weight & active, ds.p };
+        return { f * weight & active, ds.p, ds.p };
     }
 
     /// Lights at infinity in stage 3: all of them, or one chosen at random if there are many
@@ -534,34 +617,59 @@ private:
         InfiniteSamples samples;
         float p = infinite_probability();
         for (uint32_t i = 0; i < infinite_items(); ++i) {
-            Point2f u = slot_point(vertex.u.point, UInt32D(m_slots + i));
-            if (p == 1.f) {
-                samples[i] = sample_emitter(vertex, m_lights.infinite()[i], u,
-                                            Float(1.f), active);
+            Point2f u   = slot_point(vertex.u.point, UInt32D(m_slots + i));
+            auto sample = [&](const Vertex &v) {
+                if (p == 1.f)
+                    return sample_emitter(v, m_lights.infinite()[i], u, Float(1.f),
+                                          active);
+                return sample_some_infinite(v, u, active);
+            };
+            if (!vertex.at.segments) {
+                samples[i] = sample(vertex);
                 continue;
             }
-            using UInt32   = dr::uint32_array_t<Float>;
-            uint32_t count = (uint32_t) m_lights.infinite().size();
-            UInt32 index   = dr::minimum(UInt32(u.x() * (float) count), count - 1u);
-            u.x()          = u.x() * (float) count - Float(index);
-            EmitterPtr emitter =
-                dr::gather<EmitterPtr>(m_lights.infinite_dr(), index, active);
-            samples[i] = sample_emitter(vertex, emitter, u, Float(p), active);
-            samples[i].value *= (float) count;
+            FloatD t = Distances::sample_transmittance(
+                vertex.at, slot_distance(vertex, UInt32D(m_slots + i)));
+            samples[i] =
+                at_distance(vertex, t, Distances::transmittance_pdf(vertex.at, t),
+                            /* target_only = */ false, active, sample);
         }
         return samples;
     }
 
+    /// One of many lights at infinity, chosen at random
+    Sample sample_some_infinite(const Vertex &vertex, Point2f u, Mask active) const {
+        using UInt32   = dr::uint32_array_t<Float>;
+        uint32_t count = (uint32_t) m_lights.infinite().size();
+        UInt32 index   = dr::minimum(UInt32(u.x() * (float) count), count - 1u);
+        u.x()          = u.x() * (float) count - Float(index);
+        EmitterPtr emitter =
+            dr::gather<EmitterPtr>(m_lights.infinite_dr(), index, active);
+        Sample sample =
+            sample_emitter(vertex, emitter, u, Float(infinite_probability()), active);
+        sample.value *= (float) count;
+        return sample;
+    }
+
     /// Probability that `light` is a candidate at this shading point
     FloatD inclusion_probability(const Receiver<FloatD> &at, const UInt32D &light,
-                                 const FloatD &u_tree, const MaskD &active) const {
+                                 const FloatD &u_tree, const MaskD &first,
+                                 const MaskD &active) const {
         if (m_all)
             return FloatD(1.f);
         if (m_params.method == Method::Talk)
             return talk_cursor(u_tree).inclusion_probability(m_lights.tree(), at, light,
                                                              active);
-        return dr::minimum(1.f, dr::opaque<FloatD>(m_params.expected_candidates()) *
+        return dr::minimum(1.f, effort(first).candidates *
                                     leaf_probability(m_lights.tree(), at, light, active));
+    }
+
+    /// What is spent on the first vertex of a path, and on the others
+    Effort<FloatD> effort(const MaskD &first) const {
+        return { dr::select(first, dr::opaque<FloatD>(m_params.expected_candidates()),
+                            dr::opaque<FloatD>(m_params.deeper_candidates)),
+                 dr::select(first, dr::opaque<UInt32D>(m_params.shadow_rays),
+                            dr::opaque<UInt32D>(m_params.deeper_rays)) };
     }
 
     const Scene *m_scene;

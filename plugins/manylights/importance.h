@@ -35,13 +35,18 @@ template <typename Float> struct Receiver {
     /// Is this a point in a medium, without a cosine? Its extinction, where that is constant
     Mask in_medium;
     Float extinction;
+    /// A segment from p along -wi of this length (0: a point), and where a path went on
+    Float length, distance;
 
     DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, in_medium,
-                 extinction)
+                 extinction, length, distance)
 
     /// Which of the above are in use, the same for all receivers of a rendering: the lobe
     /// and the medium. What is not costs nothing.
-    bool glossy = false, media = false;
+    bool glossy = false, media = false, segments = false;
+
+    /// The part of a segment that may receive much light: some mean free paths
+    Float nearby() const { return dr::minimum(length, 6.f / extinction); }
 };
 
 /// Smallest transmittance that is assumed: how far the medium extends is not known
@@ -77,10 +82,71 @@ template <typename Float> struct Clusters {
     Four<Float> mean[3], variance, flux, axis[3];
 };
 
+/// A light as seen from a segment that starts at the origin and goes along `d`
+template <typename Value, typename Float> struct SegmentView {
+    /// Distance of the nearest point of the line from the segment's start; the light's
+    /// distance from the line, with its own extent
+    Value nearest, distance;
+    Float length;
+
+    SegmentView(const Value &along, const Value &norm2, const Value &variance,
+                const Float &length)
+        : nearest(along), length(length) {
+        Value off2 = dr::maximum(dr::fnmadd(along, along, norm2), 0.f);
+        distance   = dr::sqrt(dr::fmadd(norm2, 1e-7f, off2 + variance) + 1e-30f);
+    }
+
+    /// The angle that the segment fills
+    Value angle() const {
+        Value beyond = length - nearest;
+        return dr::atan2(length * distance,
+                         dr::fnmadd(nearest, beyond, distance * distance));
+    }
+
+    /// Point of the segment that is nearest to the light
+    Value closest() const { return dr::clip(nearest, 0.f, length); }
+};
+
 /// Smallest factor by which the direction of emission may lower h
 constexpr float kEmissionFloor = .05f;
 /// Rounds the corner of the smooth cosine, as a fraction of distance^2
 constexpr float kCosineRounding = 1e-6f;
+
+/// First harmonics of the emission in the direction -w / |w|
+template <typename Float>
+Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
+                     const Four<Float> &wy, const Four<Float> &wz,
+                     const Four<Float> &inv_norm) {
+    using F4 = Four<Float>;
+    F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * inv_norm;
+    F4 k = dr::fmadd(c.axis[0], c.axis[0],
+                     dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+    return dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - k), kEmissionFloor);
+}
+
+/**
+ * h of four clusters for a segment: flux * angle / D, which is the integral of
+ * flux / distance^2, times emission and attenuation at the nearest point.
+ */
+template <typename Float>
+Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> &c,
+                               bool oriented) {
+    using F4 = Four<Float>;
+    F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
+    F4 along =
+        -dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
+    F4 norm2     = dr::fmadd(wx, wx, dr::fmadd(wy, wy, wz * wz));
+    Float length = at.nearby();
+    SegmentView<F4, Float> view(along, norm2, c.variance, length);
+    F4 t = view.closest(), off = along - t;
+    F4 e          = dr::sqrt(dr::fmadd(off, off, dr::square(view.distance)));
+    F4 importance = c.flux * view.angle() / view.distance * attenuation(at, F4(t + e));
+    if (oriented)
+        importance *= emission(c, F4(dr::fmadd(t, F4(at.wi.x()), wx)),
+                               F4(dr::fmadd(t, F4(at.wi.y()), wy)),
+                               F4(dr::fmadd(t, F4(at.wi.z()), wz)), F4(dr::rcp(e)));
+    return importance;
+}
 
 /**
  * h of four clusters at once:
@@ -93,7 +159,8 @@ constexpr float kCosineRounding = 1e-6f;
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
  * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1.
  * In scenes with glossy surfaces h is multiplied with the receiver's \ref lobe. In a medium
- * there is no cosine, and h has the \ref attenuation.
+ * there is no cosine, and h has the \ref attenuation. For segments see
+ * \ref segment_importance.
  */
 template <typename Float>
 Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,
@@ -110,21 +177,20 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
 
     F4 projected = cosine * ie;
     if (at.media)
-        projected = dr::select(at.in_medium, F4(1.f), projected) *
-                    attenuation(at, F4(e2 * ie));
+        projected =
+            dr::select(at.in_medium, F4(1.f), projected) * attenuation(at, F4(e2 * ie));
     F4 importance = c.flux * ie2 * projected;
     if (at.glossy) {
         F4 dot_wi =
             dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
         importance *= lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2));
     }
-    if (!oriented)
-        return importance;
-    F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * ie;
-    F4 k = dr::fmadd(c.axis[0], c.axis[0],
-                     dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
-    F4 emission = dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - k), kEmissionFloor);
-    return importance * emission;
+    if (oriented)
+        importance *= emission(c, wx, wy, wz, ie);
+    if (at.segments)
+        importance =
+            dr::select(at.length > 0.f, segment_importance(at, c, oriented), importance);
+    return importance;
 }
 
 /// A row of the table, gathered
@@ -254,14 +320,25 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
  */
 template <typename Float>
 Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds) {
-    Appearance<Float> a = by_kind<Appearance<Float>>(
-        row, kinds, [&](LightKind kind) { return appearance(at, row, kind); });
+    auto look = [&](const Receiver<Float> &from) {
+        return by_kind<Appearance<Float>>(
+            row, kinds, [&](LightKind kind) { return appearance(from, row, kind); });
+    };
+    Appearance<Float> a = look(at);
+    if (at.segments) {
+        Float along = -dr::dot(at.wi, a.w);
+        // From the nearest point; a segment of length 0 is a point
+        Receiver<Float> nearest = at;
+        nearest.p -= dr::clip(along, 0.f, at.nearby()) * at.wi;
+        a = look(nearest);
+    }
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
     Float t      = dr::dot(at.n, a.w);
     t            = dr::select(at.transmits, dr::abs(t), t);
     Float cosine = .5f * (t + dr::sqrt(t * t + a.variance)) * inv_d;
     if (at.media)
-        cosine = dr::select(at.in_medium, 1.f, cosine) * attenuation(at, Float(d2 * inv_d));
+        cosine =
+            dr::select(at.in_medium, 1.f, cosine) * attenuation(at, Float(d2 * inv_d));
     Float reflectance(1.f);
     if (at.glossy)
         reflectance =

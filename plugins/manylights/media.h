@@ -61,6 +61,14 @@ public:
         DRJIT_STRUCT(Flight, mei, scattered, weight)
     };
 
+    /// Density of a distance from the densities of the channels that may be chosen for it
+    static Float channel_mean(const UnpolarizedSpectrum &density) {
+        if constexpr (mitsuba::is_rgb_v<Spectrum>)
+            return dr::mean(density);
+        else
+            return density.entry(0);
+    }
+
     /// Sample a flight over at most `distance`; lanes that are not `active` stay put
     Flight fly(const MediumPtr &medium, const Ray3f &ray, const Float &distance,
                Sampler *sampler, Mask active) const {
@@ -76,17 +84,16 @@ public:
         state.flight.weight = UnpolarizedSpectrum(1.f);
         auto step           = [&](State &s) {
             Collision c = collide(medium, s.ray, s.distance, s.sampler->next_1d(s.active),
-                                            s.active);
+                                  s.active);
             Float null_probability = dr::detach(dr::mean(c.null_fraction));
-            Mask null =
-                c.hit && m_kinds.heterogeneous &&
-                (m_kinds.heterogeneous ? s.sampler->next_1d(s.active) : Float(1.f)) <
-                    null_probability;
+            Mask null = c.hit && m_kinds.heterogeneous &&
+                        (m_kinds.heterogeneous ? s.sampler->next_1d(s.active)
+                                               : Float(1.f)) < null_probability;
             UnpolarizedSpectrum factor =
                 c.weight *
-                dr::select(null, c.mei.sigma_n / null_probability,
-                           dr::select(c.hit, c.mei.sigma_s / (1.f - null_probability),
-                                                1.f));
+                dr::select(
+                    null, c.mei.sigma_n / null_probability,
+                    dr::select(c.hit, c.mei.sigma_s / (1.f - null_probability), 1.f));
             dr::masked(s.flight.weight, s.active) = s.flight.weight * factor;
             dr::masked(s.flight.mei, s.active)    = c.mei;
             s.flight.scattered |= s.active && c.hit && !null;
@@ -95,8 +102,7 @@ public:
             dr::masked(s.distance, s.active) = s.distance - c.mei.t;
         };
         if (m_kinds.heterogeneous)
-            loop(
-                state, [](const State &s) { return s.active; }, step, "Media: flight");
+            loop(state, [](const State &s) { return s.active; }, step, "Media: flight");
         else if (dr::any_or<true>(active))
             step(state);
         return state.flight;
@@ -147,7 +153,7 @@ public:
             if (!active)
                 return result;
         }
-        Mask border               = active && si.is_medium_transition();
+        Mask border                = active && si.is_medium_transition();
         dr::masked(result, border) = si.target_medium(d);
         return result;
     }
@@ -168,8 +174,8 @@ private:
      * the extinction varies between them; in spectral ones it follows the first wavelength.
      * The distance is not differentiated, what is evaluated there is.
      */
-    Collision collide(const MediumPtr &medium, Ray3f ray, const Float &distance,
-                      Float u, Mask active) const {
+    Collision collide(const MediumPtr &medium, Ray3f ray, const Float &distance, Float u,
+                      Mask active) const {
         using UInt32 = dr::uint32_array_t<Float>;
         UInt32 channel(0);
         if constexpr (mitsuba::is_rgb_v<Spectrum>) {
@@ -188,18 +194,10 @@ private:
         Float length =
             dr::minimum(dr::minimum(c.mei.t, distance) - c.mei.mint, dr::Largest<Float>);
         UnpolarizedSpectrum tr = dr::exp(-length * majorant);
-        Float density =
-            dr::detach(channel_mean(dr::select(c.hit, tr * majorant, tr)));
+        Float density   = dr::detach(channel_mean(dr::select(c.hit, tr * majorant, tr)));
         c.weight        = dr::select(density > 0.f, tr / density, 0.f);
         c.null_fraction = dr::select(majorant > 0.f, c.mei.sigma_n / majorant, 0.f);
         return c;
-    }
-
-    static Float channel_mean(const UnpolarizedSpectrum &density) {
-        if constexpr (mitsuba::is_rgb_v<Spectrum>)
-            return dr::mean(density);
-        else
-            return density.entry(0);
     }
 
     /// Transmittance of a piece of a ray, closed form or ratio tracking
@@ -211,12 +209,12 @@ private:
             homogeneous &= medium->is_homogeneous();
         UnpolarizedSpectrum result(1.f);
         if (dr::any_or<true>(homogeneous)) {
-            MediumInteraction3f mei = dr::zeros<MediumInteraction3f>();
-            mei.p                   = ray.o;
-            mei.wi                  = -ray.d;
-            mei.sh_frame            = Frame3f(mei.wi);
-            mei.time                = ray.time;
-            mei.wavelengths         = ray.wavelengths;
+            MediumInteraction3f mei   = dr::zeros<MediumInteraction3f>();
+            mei.p                     = ray.o;
+            mei.wi                    = -ray.d;
+            mei.sh_frame              = Frame3f(mei.wi);
+            mei.time                  = ray.time;
+            mei.wavelengths           = ray.wavelengths;
             UnpolarizedSpectrum sigma = medium->get_majorant(mei, homogeneous);
             dr::masked(result, homogeneous) =
                 dr::exp(-dr::minimum(distance, dr::Largest<Float>) * sigma);
@@ -256,19 +254,17 @@ private:
     }
 
     /// Pass the surface that a shadow ray has reached
-    template <typename State>
-    void cross(State &s, const SurfaceInteraction3f &si) const {
-        BSDFPtr bsdf   = si.bsdf();
-        Spectrum value = bsdf->eval_null_transmission(si, s.active);
-        value          = si.to_world_mueller(value, si.wi, si.wi);
+    template <typename State> void cross(State &s, const SurfaceInteraction3f &si) const {
+        BSDFPtr bsdf                   = si.bsdf();
+        Spectrum value                 = bsdf->eval_null_transmission(si, s.active);
+        value                          = si.to_world_mueller(value, si.wi, si.wi);
         dr::masked(s.result, s.active) = s.result * value;
         Float left                     = s.ray.maxt - si.t;
         Ray3f next                     = si.spawn_ray(s.ray.d);
         next.maxt                      = left;
         dr::masked(s.ray, s.active)    = next;
-        s.medium = medium_beyond(si, s.medium, s.ray.d, s.active);
-        s.active &=
-            left > 0.f && dr::any(mitsuba::unpolarized_spectrum(s.result) != 0.f);
+        s.medium                       = medium_beyond(si, s.medium, s.ray.d, s.active);
+        s.active &= left > 0.f && dr::any(mitsuba::unpolarized_spectrum(s.result) != 0.f);
     }
 
     const Scene *m_scene;

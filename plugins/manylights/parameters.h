@@ -20,6 +20,11 @@ struct SamplingParameters {
     SplitFunction split_function = SplitFunction::Near;
     float splitting_rate         = 1.f;
     uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
+    /// The same at all vertices of a path but the first
+    bool segments           = getenv("SEG") ? atoi(getenv("SEG")) > 0 : true;
+    bool all_segments       = getenv("SEG") ? atoi(getenv("SEG")) > 1 : false;
+    float deeper_candidates = getenv("DK") ? atof(getenv("DK")) : 8;
+    uint32_t deeper_rays    = getenv("DS") ? atoi(getenv("DS")) : 4;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {

@@ -48,8 +48,8 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
         [&](State &s) {
             Ray3f rest = ray;
             rest.o     = ray(s.passed);
-            auto si    = s.pi.compute_surface_interaction(
-                rest, +mitsuba::RayFlags::Minimal, s.active);
+            auto si = s.pi.compute_surface_interaction(rest, +mitsuba::RayFlags::Minimal,
+                                                       s.active);
             Ray3f next = si.spawn_ray(ray.d);
             s.passed   = dr::dot(next.o - ray.o, ray.d);
             s.pi       = scene->ray_intersect_preliminary(next, true, s.active);
@@ -71,7 +71,8 @@ public:
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
                const SamplingParameters &params, const PathLimits &limits)
         : m_scene(scene), m_direct(scene, lights, params, media), m_limits(limits),
-          m_media(media.any),
+          m_media(media.any), m_segments(media.any && params.segments),
+          m_all_segments(params.all_segments),
           m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr) {}
 
     /// Radiance along a ray from the camera, and whether it met anything
@@ -85,7 +86,8 @@ public:
         loop(
             state, [](const State &s) { return s.active; }, [&](State &s) { step(s); },
             "Paths");
-        return { state.result & state.valid, state.valid };
+        // Light along a segment counts even if the path then leaves it unscattered
+        return { m_media ? state.result : state.result & state.valid, state.valid };
     }
 
 private:
@@ -108,10 +110,9 @@ private:
 
         State(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
             : active(active), valid(false), depth(0), ray(ray),
-              pi(dr::zeros<PreliminaryIntersection3f>()), medium(medium),
-              throughput(1.f), result(0.f), eta(1.f),
-              from(dr::zeros<Receiver<FloatD>>()), u_tree(0.f), pdf(1.f), specular(true),
-              sampler(sampler) {}
+              pi(dr::zeros<PreliminaryIntersection3f>()), medium(medium), throughput(1.f),
+              result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()), u_tree(0.f),
+              pdf(1.f), specular(true), sampler(sampler) {}
     };
 
     /// Where a path goes on
@@ -123,122 +124,205 @@ private:
     };
 
     void step(State &s) const {
-        InMedium inside = fly(s);
-        Mask surface    = s.active && !inside.scattered;
+        Piece piece = fly(s);
+        if (m_segments)
+            add_segment_light(s, piece);
+
+        // A segment's light is done, whatever the flight: so the surface behind is seen, too
+        Mask surface = s.active && (!piece.scattered || piece.segment);
         SurfaceInteraction3f si =
             s.pi.compute_surface_interaction(s.ray, +mitsuba::RayFlags::All, surface);
         if (m_sees_lights)
-            add_emission(s, si, surface);
+            add_emission(s, si, piece, surface);
         surface &= si.is_valid();
-        s.active = surface || (s.active && inside.scattered);
+        Mask ends_there = surface && !piece.scattered;
 
         BSDFPtr bsdf = bsdf_of(si, surface);
-        s.active &= !is_last(s) || can_pass(bsdf, surface);
+        s.active &= piece.scattered ||
+                    (ends_there && (!is_last(s) || can_pass(bsdf, ends_there)));
         if (dr::none_or<false>(s.active))
             return;
         surface &= s.active;
 
-        Vertex vertex = m_direct.prepare(si, bsdf, m_media ? &inside : nullptr,
-                                         draw_sample(s), s.active);
-        add_direct_light(s, vertex, surface);
-        scatter(s, vertex, surface);
+        Vertex vertex = m_direct.prepare(si, bsdf, m_media ? &piece.inside : nullptr,
+                                         draw_sample(s), plain(s.depth == 0u), s.active);
+        add_direct_light(s, vertex, piece, surface);
+        scatter(s, vertex, piece);
         play_roulette(s);
         intersect(s, /* coherent = */ false);
     }
 
     // --------------------------------------------------------------------- Medium event
 
+    /// What became of a piece of the path
+    struct Piece {
+        /// The medium, where the path is in one; `here` if its vertex is a point in it
+        InMedium inside;
+        /// Was it scattered before it reached the surface?
+        Mask scattered;
+        /// Is single scattering estimated along all of it? Factor of the light of its vertex
+        Mask segment;
+        UnpolarizedSpectrum seen;
+        /// Factor of the path that goes on
+        UnpolarizedSpectrum weight;
+        /// The segment as the tree sees it, and its random number
+        Receiver<FloatD> along;
+        Float u_tree;
+    };
+
     /// Move through the medium that the path is in
-    InMedium fly(State &s) const {
-        InMedium inside{ s.medium, dr::zeros<MediumInteraction3f>(), Mask(false) };
+    Piece fly(State &s) const {
+        Piece piece{ { s.medium, dr::zeros<MediumInteraction3f>(), Mask(false), s.ray.o,
+                       Float(0.f) },
+                     Mask(false),
+                     Mask(false),
+                     UnpolarizedSpectrum(1.f),
+                     UnpolarizedSpectrum(1.f),
+                     dr::zeros<Receiver<FloatD>>(),
+                     Float(0.f) };
         if (!m_media)
-            return inside;
-        Mask within = s.active && s.medium != nullptr;
+            return piece;
+        InMedium &inside = piece.inside;
+        Mask within      = s.active && s.medium != nullptr;
         if (dr::any_or<true>(within)) {
             auto flight =
                 m_direct.media().fly(s.medium, s.ray, s.pi.t, s.sampler, within);
-            inside.mei       = flight.mei;
-            inside.scattered = within && flight.scattered;
-            dr::masked(s.throughput, within) = s.throughput * flight.weight;
-            s.active &= !(inside.scattered && is_last(s));
-            inside.scattered &= s.active;
-            s.valid |= inside.scattered;
+            inside.mei      = flight.mei;
+            piece.scattered = within && flight.scattered && !is_last(s);
+            piece.weight    = dr::select(within, flight.weight, 1.f);
+            s.active &= !(flight.scattered && within) || piece.scattered;
+            s.valid |= piece.scattered;
+            piece.seen = piece.weight;
+            if (m_segments)
+                find_segment(s, piece, within);
+            inside.here = piece.scattered && !piece.segment;
         }
         inside.mei.time        = s.ray.time;
         inside.mei.wavelengths = s.ray.wavelengths;
-        return inside;
+        return piece;
     }
 
-    // ---------------------------------------------------------------------- Emitter hit
+    /// Is this a piece whose single scattering is estimated as a whole?
+    void find_segment(const State &s, Piece &piece, Mask within) const {
+        piece.segment = within && s.medium->is_homogeneous() &&
+                        s.medium->use_emitter_sampling() && !is_last(s);
+        if (!m_all_segments)
+            piece.segment &= s.depth == 0u;
+        UnpolarizedSpectrum sigma = piece.inside.mei.combined_extinction;
+        dr::masked(piece.seen, piece.segment) =
+            dr::exp(-dr::minimum(s.pi.t, dr::Largest<Float>) * sigma);
+    }
+
+    // ------------------------------------------------------------------- Light of a vertex
+
+    LightSample<Float> draw_sample(State &s, bool distance = false) const {
+        Float tree = m_direct.uses_tree() ? s.sampler->next_1d(s.active) : Float(0.f),
+              selection = m_direct.selects() ? s.sampler->next_1d(s.active) : Float(0.f);
+        return { tree, selection, s.sampler->next_2d(s.active),
+                 distance ? s.sampler->next_1d(s.active) : Float(0.f) };
+    }
 
     /// Emission of the surface (or the environment) that the path has come to
-    void add_emission(State &s, const SurfaceInteraction3f &si, Mask active) const {
+    void add_emission(State &s, const SurfaceInteraction3f &si, const Piece &piece,
+                      Mask active) const {
         if (m_limits.hide_emitters) // area emitters were skipped, the environment not
             active &= s.depth > 0u || si.is_valid();
         auto [radiance, light] = m_direct.emission().emitted(si, active);
-        Float light_pdf        = m_direct.hit_density(s.from, s.u_tree, si, light,
-                                                      active && !s.specular);
-        Float weight =
-            dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
-        dr::masked(s.result, active) =
-            s.result + s.throughput * radiance * dr::detach(weight);
+        Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
+                                               light, active && !s.specular);
+        Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
+        add(s, radiance * dr::detach(weight), piece, active);
         s.valid |= active && light != kNone;
     }
 
-    // --------------------------------------------------------------------- Direct light
-
-    LightSample<Float> draw_sample(State &s) const {
-        Float tree      = m_direct.uses_tree() ? s.sampler->next_1d(s.active) : Float(0.f),
-              selection = m_direct.selects() ? s.sampler->next_1d(s.active) : Float(0.f);
-        return { tree, selection, s.sampler->next_2d(s.active) };
+    /// Single scattering along a whole piece of the path, whatever its flight
+    void add_segment_light(State &s, Piece &piece) const {
+        Mask active = s.active && piece.segment;
+        if (dr::none_or<false>(active))
+            return;
+        InMedium along       = piece.inside;
+        along.here           = active;
+        along.length         = dr::select(active, s.pi.t, 0.f);
+        const auto si        = dr::zeros<SurfaceInteraction3f>();
+        const BSDFPtr bsdf   = dr::zeros<BSDFPtr>();
+        Vertex vertex        = m_direct.prepare(si, bsdf, &along, draw_sample(s, true),
+                                                plain(s.depth == 0u), active);
+        piece.along          = vertex.at;
+        piece.u_tree         = vertex.u.tree;
+        piece.along.distance = plain(piece.inside.mei.t);
+        dr::masked(s.result, active) =
+            s.result + s.throughput * m_direct.sample_lights(vertex, active);
     }
 
-    void add_direct_light(State &s, const Vertex &vertex, Mask surface) const {
+    void add_direct_light(State &s, const Vertex &vertex, const Piece &piece,
+                          Mask surface) const {
         Mask lit = surface && has_flag(vertex.bsdf->flags(), mitsuba::BSDFFlags::Smooth);
         if (m_media) {
-            lit &= !is_last(s);
-            Mask scattered = s.active && vertex.inside->scattered;
-            if (dr::any_or<true>(scattered))
-                lit |= scattered && vertex.inside->mei.medium->use_emitter_sampling();
+            lit &= !is_last(s) && dr::any(piece.seen != 0.f);
+            Mask here = s.active && vertex.inside->here;
+            if (dr::any_or<true>(here))
+                lit |= here && vertex.inside->medium->use_emitter_sampling();
         }
         if (dr::any_or<true>(lit))
-            dr::masked(s.result, lit) =
-                s.result + s.throughput * m_direct.sample_lights(vertex, lit);
+            add(s, m_direct.sample_lights(vertex, lit), piece, lit);
+    }
+
+    /// Add radiance of the vertex at the end of a piece
+    void add(State &s, const Spectrum &radiance, const Piece &piece, Mask active) const {
+        Spectrum value = s.throughput * radiance;
+        if (m_media)
+            value *= piece.seen;
+        dr::masked(s.result, active) = s.result + value;
     }
 
     // ----------------------------------------------------------------------- Scattering
 
     /// Continue in a direction sampled from the BSDF or the phase function
-    void scatter(State &s, const Vertex &vertex, Mask surface) const {
+    void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
         Direction next = dr::zeros<Direction>();
         Float u1       = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
+        Mask surface   = s.active && !piece.scattered;
         if (dr::any_or<true>(surface))
             next = sample_bsdf(vertex, u1, u2, surface);
-        if (m_media) {
-            Mask scattered = s.active && vertex.inside->scattered;
-            if (dr::any_or<true>(scattered))
-                merge(next, sample_phase(s, vertex, u1, u2, scattered), scattered);
-        }
+        Mask scattered = s.active && piece.scattered;
+        if (m_media && dr::any_or<true>(scattered))
+            next = merge(next, sample_phase(s, piece, u1, u2, scattered), scattered);
 
         s.throughput *= next.weight;
+        if (m_media)
+            s.throughput *= piece.weight;
         s.eta *= next.eta;
         Mask counts = !next.null;
         s.valid |= s.active && counts;
         // Where null surfaces are no vertices, what light sampling knows is left in place
-        Mask leaves = m_media ? counts : Mask(true);
-        s.from      = dr::select(plain(leaves), vertex.at, s.from);
-        set_flags(s.from, vertex.at);
-        s.u_tree   = dr::select(leaves, vertex.u.tree, s.u_tree);
-        s.pdf      = dr::select(leaves, dr::detach(next.pdf), s.pdf);
-        s.specular = dr::select(leaves, next.specular, s.specular);
-        dr::masked(s.depth, leaves) = s.depth + 1u;
+        remember(s, vertex, piece, next, m_media ? counts : Mask(true));
         if (m_media) {
             s.active &= s.depth < m_limits.max_depth;
-            s.medium = m_direct.media().medium_beyond(vertex.si, s.medium, next.ray.d,
-                                                      surface);
+            s.medium =
+                m_direct.media().medium_beyond(vertex.si, s.medium, next.ray.d, surface);
         }
         s.ray = next.ray;
+    }
+
+    /// What the density of finding a light by chance needs of the vertex that a path leaves
+    void remember(State &s, const Vertex &vertex, const Piece &piece,
+                  const Direction &next, Mask leaves) const {
+        Receiver<FloatD> at = vertex.at;
+        Float u_tree        = vertex.u.tree;
+        if (m_segments) {
+            Mask along = piece.scattered && piece.segment;
+            at         = dr::select(plain(along), piece.along, at);
+            u_tree     = dr::select(along, piece.u_tree, u_tree);
+        }
+        s.from                      = dr::select(plain(leaves), at, s.from);
+        s.from.glossy               = vertex.at.glossy;
+        s.from.media                = vertex.at.media;
+        s.from.segments             = m_segments;
+        s.u_tree                    = dr::select(leaves, u_tree, s.u_tree);
+        s.pdf                       = dr::select(leaves, dr::detach(next.pdf), s.pdf);
+        s.specular                  = dr::select(leaves, next.specular, s.specular);
+        dr::masked(s.depth, leaves) = s.depth + 1u;
     }
 
     Direction sample_bsdf(const Vertex &vertex, const Float &u1, const Point2f &u2,
@@ -250,10 +334,10 @@ private:
         Ray3f ray         = si.spawn_ray(si.to_world(bs.wo));
         if (dr::grad_enabled(ray)) {
             // Directions are not differentiated: evaluate again what depends on them
-            ray               = dr::detach<true>(ray);
-            Vector3f wo       = si.to_local(ray.d);
-            auto [value, pdf] = vertex.bsdf->eval_pdf(ctx, si, wo, active);
-            value             = si.to_world_mueller(value, -wo, si.wi);
+            ray                           = dr::detach<true>(ray);
+            Vector3f wo                   = si.to_local(ray.d);
+            auto [value, pdf]             = vertex.bsdf->eval_pdf(ctx, si, wo, active);
+            value                         = si.to_world_mueller(value, -wo, si.wi);
             dr::masked(weight, pdf > 0.f) = value / dr::detach(pdf);
         }
         return { ray,
@@ -264,11 +348,11 @@ private:
                  has_flag(bs.sampled_type, mitsuba::BSDFFlags::Null) };
     }
 
-    Direction sample_phase(const State &s, const Vertex &vertex, const Float &u1,
+    Direction sample_phase(const State &s, const Piece &piece, const Float &u1,
                            const Point2f &u2, Mask active) const {
-        const MediumInteraction3f &mei = vertex.inside->mei;
+        const MediumInteraction3f &mei = piece.inside.mei;
         mitsuba::PhaseFunctionContext<Float, Spectrum> ctx(s.sampler);
-        auto phase             = vertex.phase(active);
+        auto phase             = phase_of(mei, active);
         auto [wo, weight, pdf] = phase->sample(ctx, mei, u1, u2, active);
         Ray3f ray              = mei.spawn_ray(wo);
         if (dr::grad_enabled(ray)) {
@@ -276,21 +360,23 @@ private:
             auto [value, pdf2] = phase->eval_pdf(ctx, mei, ray.d, active);
             weight             = value / dr::detach(pdf2);
         }
-        return { ray,
-                 weight & (active && pdf > 0.f),
-                 pdf,
-                 Float(1.f),
-                 !mei.medium->use_emitter_sampling(),
-                 Mask(false) };
+        if (m_segments) { // a density of distance and direction, as that of light sampling
+            const UnpolarizedSpectrum &sigma = mei.combined_extinction;
+            Float density =
+                Media<Float, Spectrum>::channel_mean(sigma * dr::exp(-mei.t * sigma));
+            dr::masked(pdf, piece.segment) = pdf * density;
+        }
+        return { ray,        weight & (active && pdf > 0.f),      pdf,
+                 Float(1.f), !mei.medium->use_emitter_sampling(), Mask(false) };
     }
 
-    static void merge(Direction &a, const Direction &b, Mask use_b) {
-        a.ray      = dr::select(use_b, b.ray, a.ray);
-        a.weight   = dr::select(use_b, b.weight, a.weight);
-        a.pdf      = dr::select(use_b, b.pdf, a.pdf);
-        a.eta      = dr::select(use_b, b.eta, a.eta);
-        a.specular = dr::select(use_b, b.specular, a.specular);
-        a.null     = dr::select(use_b, b.null, a.null);
+    static Direction merge(const Direction &a, const Direction &b, Mask use_b) {
+        return { dr::select(use_b, b.ray, a.ray),
+                 dr::select(use_b, b.weight, a.weight),
+                 dr::select(use_b, b.pdf, a.pdf),
+                 dr::select(use_b, b.eta, a.eta),
+                 dr::select(use_b, b.specular, a.specular),
+                 dr::select(use_b, b.null, a.null) };
     }
 
     // --------------------------------------------------------------------------- Ending
@@ -326,15 +412,10 @@ private:
         return si.bsdf();
     }
 
-    static void set_flags(Receiver<FloatD> &to, const Receiver<FloatD> &from) {
-        to.glossy = from.glossy;
-        to.media  = from.media;
-    }
-
     const Scene *m_scene;
     DirectLight m_direct;
     PathLimits m_limits;
-    bool m_media, m_sees_lights;
+    bool m_media, m_segments, m_all_segments, m_sees_lights;
 };
 
 } // namespace manylights

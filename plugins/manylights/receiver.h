@@ -16,6 +16,7 @@ template <typename Float, typename Spectrum> class ReceiverReader {
 public:
     MI_IMPORT_TYPES(BSDFPtr, MediumPtr)
     using FloatD = dr::detached_t<Float>;
+    using MaskD  = dr::mask_t<FloatD>;
 
     /// Positive wherever the value is not zero; invalid values are never chosen
     static FloatD target(const Spectrum &value) {
@@ -36,28 +37,34 @@ public:
         Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
         Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
         Receiver<FloatD> at = dr::zeros<Receiver<FloatD>>();
-        at.p         = plain(si.p);
-        at.n         = plain(n);
-        at.wi        = plain(si.to_world(si.wi));
-        at.transmits = plain(transmits);
+        at.p                = plain(si.p);
+        at.n                = plain(n);
+        at.wi               = plain(si.to_world(si.wi));
+        at.transmits        = plain(transmits);
         if (glossy)
             measure_lobe(si, bsdf, at, active);
         return at;
     }
 
-    /// The medium around a surface, or a point in the medium: no cosine, no lobe
-    static void add_medium(Receiver<FloatD> &at, const MediumInteraction3f &mei,
-                           const MediumPtr &medium, const Mask &scattered, Mask active) {
-        active &= medium != nullptr;
+    /// The medium around a surface, or a point or a segment in the medium: no cosine, no lobe
+    template <typename InMedium>
+    static void add_medium(Receiver<FloatD> &at, const InMedium &inside, Mask active) {
+        active &= inside.medium != nullptr;
         if (dr::any_or<true>(active))
-            active &= medium->is_homogeneous();
-        FloatD extinction = plain(dr::mean(mei.combined_extinction));
+            active &= inside.medium->is_homogeneous();
+        // The channel of the smallest extinction sees farthest
+        const UnpolarizedSpectrum &sigma = inside.mei.combined_extinction;
+        FloatD extinction = plain(dr::maximum(dr::min(sigma), .05f * dr::mean(sigma)));
+        MaskD here        = plain(inside.here);
         at.extinction     = dr::select(plain(active), extinction, 0.f);
-        at.in_medium      = plain(scattered);
-        dr::masked(at.p, at.in_medium)        = plain(mei.p);
-        dr::masked(at.n, at.in_medium)        = 0.f;
-        dr::masked(at.diffuse, at.in_medium)  = 1.f;
-        dr::masked(at.specular, at.in_medium) = 0.f;
+        at.in_medium      = here;
+        at.length         = plain(inside.length);
+        at.p              = dr::select(at.length > 0.f, plain(inside.start),
+                                       dr::select(here, plain(inside.mei.p), at.p));
+        at.wi             = dr::select(here, plain(inside.mei.wi), at.wi);
+        dr::masked(at.n, here)        = 0.f;
+        dr::masked(at.diffuse, here)  = 1.f;
+        dr::masked(at.specular, here) = 0.f;
     }
 
 private:

@@ -6,7 +6,7 @@
  */
 
 #include "media.h"
-#include "receiver.h"
+#include "segment.h"
 
 namespace manylights {
 
@@ -15,6 +15,14 @@ template <typename Float> struct LightSample {
     using Point2f = mitsuba::Point<Float, 2>;
     Float tree, selection;
     Point2f point;
+    /// Along a segment
+    Float distance = Float(0.f);
+};
+
+/// How many lights a vertex considers (expected candidates K), and how many it traces
+template <typename Float> struct Effort {
+    Float candidates;
+    dr::uint32_array_t<Float> shadow_rays;
 };
 
 /// The medium that surrounds a path, and where it scatters therein
@@ -23,54 +31,72 @@ template <typename Float, typename Spectrum> struct InMedium {
     MediumPtr medium;
     MediumInteraction3f mei;
     /// Is the vertex in the medium? Otherwise it is the surface at the end of the ray.
-    Mask scattered;
+    Mask here;
+    /// Is it all of a segment that starts at `start`? Its length (0: a point)
+    Point3f start;
+    Float length;
 };
 
+/// The phase function around a point in a medium, null in other lanes
+template <typename MediumInteraction3f, typename Mask>
+auto phase_of(const MediumInteraction3f &mei, Mask active) {
+    auto result                 = mei.medium->phase_function();
+    dr::masked(result, !active) = nullptr;
+    return result;
+}
+
+/// A vertex on a surface, at a point in a medium, or anywhere on a segment in a medium
 template <typename Float, typename Spectrum> struct Vertex {
     MI_IMPORT_TYPES(Sampler, BSDFPtr, PhaseFunctionPtr)
-    using FloatD   = dr::detached_t<Float>;
-    using InMedium = manylights::InMedium<Float, Spectrum>;
+    using FloatD    = dr::detached_t<Float>;
+    using InMedium  = manylights::InMedium<Float, Spectrum>;
+    using Reader    = ReceiverReader<Float, Spectrum>;
+    using Distances = SegmentDistances<FloatD>;
 
-    /// The vertex on a surface ...
     const SurfaceInteraction3f &si;
     const BSDFPtr &bsdf;
-    /// ... or in a medium; null if the scene has none
+    /// Null if the scene has no media
     const InMedium *inside;
     LightSample<Float> u;
+    Effort<FloatD> effort;
     /// As the tree sees it
     Receiver<FloatD> at;
+    /// On a segment: density of free flights over that of the chosen distance, so that light
+    /// sampling and phase sampling are compared as densities of distance and direction
+    Float flight_ratio = Float(1.f);
 
     Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
-           const LightSample<Float> &u, bool glossy, Mask active)
-        : si(si), bsdf(bsdf), inside(inside), u(u) {
-        Mask surface = active;
+           const LightSample<Float> &u, const Effort<FloatD> &effort, bool glossy,
+           bool segments, Mask active)
+        : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort) {
+        Mask surface = on_surface(active);
+        at           = dr::any_or<true>(surface) ? Reader::read(si, bsdf, glossy, surface)
+                                                 : dr::zeros<Receiver<FloatD>>();
         if (inside)
-            surface &= !inside->scattered;
-        using Reader = ReceiverReader<Float, Spectrum>;
-        at           = dr::any_or<true>(surface)
-                           ? Reader::read(si, bsdf, glossy, surface)
-                           : dr::zeros<Receiver<FloatD>>();
-        if (inside)
-            Reader::add_medium(at, inside->mei, inside->medium, inside->scattered,
-                               active);
-        at.glossy = glossy;
-        at.media  = inside != nullptr;
+            Reader::add_medium(at, *inside, active);
+        at.glossy   = glossy;
+        at.media    = inside != nullptr;
+        at.segments = inside && segments;
+    }
+
+    Mask on_surface(Mask active) const {
+        return inside ? Mask(active && !inside->here) : active;
     }
 
     /// Where its shadow rays start
     Interaction3f origin() const {
         Interaction3f it(si);
         if (inside) {
-            dr::masked(it.p, inside->scattered) = inside->mei.p;
-            dr::masked(it.n, inside->scattered) = 0.f;
-            it.time                             = inside->mei.time;
-            it.wavelengths                      = inside->mei.wavelengths;
+            dr::masked(it.p, inside->here) = inside->mei.p;
+            dr::masked(it.n, inside->here) = 0.f;
+            it.time                        = inside->mei.time;
+            it.wavelengths                 = inside->mei.wavelengths;
         }
         return it;
     }
 
     /// BSDF times cosine, or phase function, towards `d`, and the density of sampling `d`
-    /// (surfaces: if wanted)
+    /// (on surfaces only if wanted)
     std::pair<Spectrum, Float> eval_pdf(const Vector3f &d, bool with_pdf,
                                         Mask active) const {
         std::pair<Spectrum, Float> result(0.f, 0.f);
@@ -84,26 +110,16 @@ template <typename Float, typename Spectrum> struct Vertex {
                 result.first = bsdf->eval(ctx, si, wo, surface);
             result.first = si.to_world_mueller(result.first, -wo, si.wi);
         }
-        if (inside) {
-            Mask scattered = active && inside->scattered;
-            if (dr::any_or<true>(scattered)) {
-                auto [value, pdf] = phase(scattered)->eval_pdf(
-                    mitsuba::PhaseFunctionContext<Float, Spectrum>(), inside->mei, d,
-                    scattered);
-                dr::masked(result.first, scattered)  = value;
-                dr::masked(result.second, scattered) = pdf;
-            }
+        if (!inside)
+            return result;
+        Mask scattered = active && inside->here;
+        if (dr::any_or<true>(scattered)) {
+            mitsuba::PhaseFunctionContext<Float, Spectrum> ctx;
+            auto [value, pdf] = phase_of(inside->mei, scattered)
+                                    ->eval_pdf(ctx, inside->mei, d, scattered);
+            dr::masked(result.first, scattered)  = value;
+            dr::masked(result.second, scattered) = pdf * flight_ratio;
         }
-        return result;
-    }
-
-    Mask on_surface(Mask active) const {
-        return inside ? Mask(active && !inside->scattered) : active;
-    }
-
-    PhaseFunctionPtr phase(Mask active) const {
-        PhaseFunctionPtr result = inside->mei.medium->phase_function();
-        dr::masked(result, !active) = nullptr;
         return result;
     }
 };

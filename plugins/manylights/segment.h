@@ -1,0 +1,73 @@
+#pragma once
+
+/**
+ * Single scattering along a segment of a ray in a homogeneous medium: distances that suit a
+ * light.
+ *
+ * The light that a segment receives from a point at the distance D of the ray grows like
+ * 1 / (D^2 + t^2), which free-flight sampling does not see: with a light next to the ray its
+ * variance is unbounded. So lights are chosen for the whole segment, and a distance for each
+ * of them, half of the time with equal angles as seen from the light (Kulla and Fajardo,
+ * "Importance Sampling Techniques for Path Tracing in Participating Media", 2012), half
+ * of the time in proportion to the transmittance.
+ */
+
+#include "receiver.h"
+
+namespace manylights {
+
+/// Distances along a segment for one light
+template <typename Float> class SegmentDistances {
+public:
+    using Receiver = manylights::Receiver<Float>;
+    using Vector3f = mitsuba::Vector<Float, 3>;
+
+    /// @param w  from the start of the segment to the light's centre
+    SegmentDistances(const Receiver &at, const Vector3f &w, const Float &variance)
+        : m_at(at),
+          m_view(-dr::dot(at.wi, w), dr::squared_norm(w), variance, at.nearby()),
+          m_angle(m_view.angle()) {}
+
+    Float sample(const Float &u) const {
+        Float v = 2.f * u;
+        return dr::select(v < 1.f, sample_equiangular(v),
+                          sample_transmittance(m_at, v - 1.f));
+    }
+
+    Float pdf(const Float &t) const {
+        Float offset = t - m_view.nearest, d2 = dr::square(m_view.distance);
+        Float equiangular = m_view.distance / (m_angle * dr::fmadd(offset, offset, d2));
+        equiangular       = dr::select(t <= m_view.length, equiangular, 0.f);
+        return .5f * (equiangular + transmittance_pdf(m_at, t));
+    }
+
+    /// Density proportional to the transmittance, or constant if that hardly changes
+    static Float sample_transmittance(const Receiver &at, const Float &u) {
+        Float depth = at.extinction * at.length;
+        Float t     = -dr::log(1.f - u * (1.f - dr::exp(-depth))) / at.extinction;
+        return dr::minimum(dr::select(depth < kThin, u * at.length, t), at.length);
+    }
+    static Float transmittance_pdf(const Receiver &at, const Float &t) {
+        Float depth = at.extinction * at.length;
+        Float pdf = at.extinction * dr::exp(-at.extinction * t) / (1.f - dr::exp(-depth));
+        return dr::select(depth < kThin, dr::rcp(at.length), pdf);
+    }
+
+private:
+    static constexpr float kThin = .02f;
+
+    /// n^2 sin / (D cos + nearest sin) with the angle from the segment's start, at a distance
+    /// n from the light: no difference of large numbers
+    Float sample_equiangular(const Float &v) const {
+        auto [sin, cos] = dr::sincos(v * m_angle);
+        Float n2        = dr::square(m_view.nearest) + dr::square(m_view.distance);
+        Float t = n2 * sin / dr::fmadd(m_view.distance, cos, m_view.nearest * sin);
+        return dr::clip(t, 0.f, m_view.length);
+    }
+
+    const Receiver &m_at;
+    SegmentView<Float, Float> m_view;
+    Float m_angle;
+};
+
+} // namespace manylights
