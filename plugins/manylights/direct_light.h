@@ -60,7 +60,7 @@ public:
         m_keep_all = most <= (float) params.reservoirs;
         m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
         m_items    = m_slots + infinite_items();
-        m_choose   = m_items > std::min(params.shadow_rays, params.deeper_rays);
+        m_choose   = m_items > params.shadow_rays_deeper();
     }
 
     const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
@@ -86,8 +86,17 @@ public:
                  u,
                  effort(first),
                  m_lights.glossy() && !m_all,
-                 m_params.segments,
+                 Extent::Point,
                  active };
+    }
+
+    /// All of a segment in a homogeneous medium
+    Vertex prepare_segment(const SurfaceInteraction3f &behind, const BSDFPtr &no_bsdf,
+                           const typename Vertex::InMedium &inside,
+                           const LightSample<Float> &u, const MaskD &first,
+                           Mask active) const {
+        return { behind,        no_bsdf, &inside,         u,
+                 effort(first), false,   Extent::Segment, active };
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
@@ -131,7 +140,7 @@ public:
                       const SurfaceInteraction3f &hit, const UInt32D &light,
                       Mask active) const {
         auto p = at.p;
-        if (at.segments)
+        if (at.extent == Extent::Either)
             p -= at.distance * at.wi;
         Interaction3f from(0.f, hit.time, hit.wavelengths, Point3f(p));
         Float result(0.f);
@@ -153,7 +162,7 @@ public:
                         m_emission.emitter_of(row)->pdf_direction(from, ds, other);
                 }
             }
-            if (at.segments)
+            if (at.extent == Extent::Either)
                 result *= Float(dr::select(at.length > 0.f,
                                            distances(at, row).pdf(at.distance), 1.f));
             result *= Float(
@@ -166,7 +175,7 @@ public:
             DirectionSample3f ds(m_scene, hit, from);
             dr::masked(result, missed) =
                 infinite_probability() * environment->pdf_direction(from, ds, missed);
-            if (at.segments)
+            if (at.extent == Extent::Either)
                 dr::masked(result, missed && Mask(at.length > 0.f)) =
                     result * Float(Distances::transmittance_pdf(at, at.distance));
         }
@@ -417,8 +426,8 @@ private:
     Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
                      Mask active) const {
         Interaction3f origin = vertex.origin();
-        if (vertex.at.segments)
-            origin.p = dr::select(Mask(vertex.at.length > 0.f), sample.from, origin.p);
+        if (vertex.at.extent == Extent::Segment)
+            origin.p = sample.from;
         Ray3f ray = origin.spawn_ray_to(sample.p);
         if (!vertex.inside) {
             Mask occluded = m_scene->ray_test(ray, active);
@@ -436,8 +445,8 @@ private:
                                            /* target_only = */ true, active);
         FloatD target = Reader::target(sample.value);
         if (vertex.at.media) {
-            auto from =
-                dr::select(vertex.at.length > 0.f, plain(sample.from), vertex.at.p);
+            bool segment = vertex.at.extent == Extent::Segment;
+            auto from    = segment ? plain(sample.from) : vertex.at.p;
             target *= attenuation(vertex.at, dr::norm(plain(sample.p) - from));
         }
         return target;
@@ -468,7 +477,7 @@ private:
         Vertex moved(vertex);
         moved.inside                           = &here;
         dr::masked(moved.at.p, plain(segment)) = plain(here.mei.p);
-        moved.at.segments                      = false;
+        moved.at.extent                        = Extent::Point;
 
         UnpolarizedSpectrum sigma = here.mei.combined_extinction,
                             tr    = dr::exp(-Float(t) * sigma);
@@ -501,7 +510,7 @@ private:
         auto sample     = [&](const Vertex &v) {
             return sample_row_point(v, row, inclusion, slot, target_only, active);
         };
-        if (!vertex.at.segments)
+        if (vertex.at.extent == Extent::Point)
             return sample(vertex);
         Distances along = distances(vertex.at, row);
         FloatD t        = along.sample(slot_distance(vertex, slot));
@@ -624,7 +633,7 @@ private:
                                           active);
                 return sample_some_infinite(v, u, active);
             };
-            if (!vertex.at.segments) {
+            if (vertex.at.extent == Extent::Point) {
                 samples[i] = sample(vertex);
                 continue;
             }
@@ -667,9 +676,9 @@ private:
     /// What is spent on the first vertex of a path, and on the others
     Effort<FloatD> effort(const MaskD &first) const {
         return { dr::select(first, dr::opaque<FloatD>(m_params.expected_candidates()),
-                            dr::opaque<FloatD>(m_params.deeper_candidates)),
+                            dr::opaque<FloatD>(m_params.expected_deeper())),
                  dr::select(first, dr::opaque<UInt32D>(m_params.shadow_rays),
-                            dr::opaque<UInt32D>(m_params.deeper_rays)) };
+                            dr::opaque<UInt32D>(m_params.shadow_rays_deeper())) };
     }
 
     const Scene *m_scene;

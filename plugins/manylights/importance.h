@@ -19,6 +19,9 @@
 
 namespace manylights {
 
+/// What a receiver is: known when kernels are recorded, except where paths look back
+enum class Extent { Point, Segment, Either };
+
 /// What a shading point shows to the tree
 template <typename Float> struct Receiver {
     using Vector3f = mitsuba::Vector<Float, 3>;
@@ -43,7 +46,8 @@ template <typename Float> struct Receiver {
 
     /// Which of the above are in use, the same for all receivers of a rendering: the lobe
     /// and the medium. What is not costs nothing.
-    bool glossy = false, media = false, segments = false;
+    bool glossy = false, media = false;
+    Extent extent = Extent::Point;
 
     /// The part of a segment that may receive much light: some mean free paths
     Float nearby() const { return dr::minimum(length, 6.f / extinction); }
@@ -166,6 +170,8 @@ template <typename Float>
 Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,
                                bool oriented) {
     using F4 = Four<Float>;
+    if (at.extent == Extent::Segment)
+        return segment_importance(at, c, oriented);
     F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
     F4 e2 = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
     F4 ie = dr::rsqrt(e2), ie2 = ie * ie;
@@ -187,7 +193,7 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
     }
     if (oriented)
         importance *= emission(c, wx, wy, wz, ie);
-    if (at.segments)
+    if (at.extent == Extent::Either)
         importance =
             dr::select(at.length > 0.f, segment_importance(at, c, oriented), importance);
     return importance;
@@ -325,9 +331,8 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
             row, kinds, [&](LightKind kind) { return appearance(from, row, kind); });
     };
     Appearance<Float> a = look(at);
-    if (at.segments) {
-        Float along = -dr::dot(at.wi, a.w);
-        // From the nearest point; a segment of length 0 is a point
+    if (at.extent == Extent::Segment) {
+        Float along             = -dr::dot(at.wi, a.w);
         Receiver<Float> nearest = at;
         nearest.p -= dr::clip(along, 0.f, at.nearby()) * at.wi;
         a = look(nearest);

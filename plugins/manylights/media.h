@@ -20,13 +20,13 @@ namespace manylights {
 
 /// What kinds of media there are: code for others is not even recorded
 struct MediaKinds {
-    bool any = false, heterogeneous = false;
+    bool any = false, homogeneous = false, heterogeneous = false;
 
     template <typename Medium> void add(const Medium *medium) {
         if (!medium)
             return;
-        any = true;
-        heterogeneous |= !medium->is_homogeneous();
+        any                                                      = true;
+        (medium->is_homogeneous() ? homogeneous : heterogeneous) = true;
     }
 };
 

@@ -54,9 +54,8 @@ size_t read_choice(const Properties &props, const std::string &name,
 const std::vector<std::string> kMethods        = { "resampled_tree", "talk" };
 const std::vector<std::string> kSplitFunctions = { "near", "far" };
 
-} // namespace
-
-SamplingParameters read_path_parameters(const Properties &props) {
+/// What all integrators have in common
+SamplingParameters read_light_parameters(const Properties &props) {
     SamplingParameters p;
     p.method         = (Method) read_choice(props, "method", kMethods);
     p.splitting_rate = read_rate(props, p.splitting_rate);
@@ -72,9 +71,18 @@ SamplingParameters read_path_parameters(const Properties &props) {
     return p;
 }
 
+} // namespace
+
 SamplingParameters read_parameters(const Properties &props) {
-    SamplingParameters p = read_path_parameters(props);
+    SamplingParameters p = read_light_parameters(props);
     p.bsdf_samples       = read_count(props, "bsdf_samples", p.bsdf_samples, 0, 1024);
+    return p;
+}
+
+SamplingParameters read_path_parameters(const Properties &props) {
+    SamplingParameters p = read_light_parameters(props);
+    p.deeper_candidates  = 3.f / 8.f;
+    p.deeper_rays        = 1.f / 4.f;
     return p;
 }
 

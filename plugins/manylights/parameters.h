@@ -20,15 +20,19 @@ struct SamplingParameters {
     SplitFunction split_function = SplitFunction::Near;
     float splitting_rate         = 1.f;
     uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
-    /// The same at all vertices of a path but the first
-    bool segments           = getenv("SEG") ? atoi(getenv("SEG")) > 0 : true;
-    bool all_segments       = getenv("SEG") ? atoi(getenv("SEG")) > 1 : false;
-    float deeper_candidates = getenv("DK") ? atof(getenv("DK")) : 8;
-    uint32_t deeper_rays    = getenv("DS") ? atoi(getenv("DS")) : 4;
+    /// What the vertices of a path after its first one get of candidates and shadow rays
+    float deeper_candidates = 1.f, deeper_rays = 1.f;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
         return std::max(1.f, kCandidatesPerRate * splitting_rate);
+    }
+    /// The same, and the number of shadow rays, at later vertices
+    float expected_deeper() const {
+        return std::max(1.f, deeper_candidates * kCandidatesPerRate * splitting_rate);
+    }
+    uint32_t shadow_rays_deeper() const {
+        return (uint32_t) std::ceil(deeper_rays * (float) shadow_rays);
     }
     /// Upper limit of the number of candidates
     float most_candidates() const {
@@ -42,7 +46,14 @@ struct SamplingParameters {
 /// Read and check the parameters; throws with the name, the value and what is allowed
 SamplingParameters read_parameters(const mitsuba::Properties &props);
 
-/// The same for paths, where one direction is sampled at each vertex (no `bsdf_samples`)
+/**
+ * The same for paths, where one direction is sampled at each vertex (no `bsdf_samples`).
+ *
+ * After the first vertex paths spend 3/8 of the candidates and a quarter of the shadow rays,
+ * that is K = 3 and s = 1 by default. At depth 6 and equal time (llvm_ad_rgb, 1,000 lights)
+ * K, s = 8, 4 / 8, 1 / 3, 1 / 2, 1 / 1, 1 had 68 / 71 / 101 / 86 / 55 times less error than
+ * `path` in rooms, and 6.4 / 7.7 / 9.1 / 10.1 / 9.4 times in a city of points.
+ */
 SamplingParameters read_path_parameters(const mitsuba::Properties &props);
 
 /// "name = value" lines

@@ -71,8 +71,7 @@ public:
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
                const SamplingParameters &params, const PathLimits &limits)
         : m_scene(scene), m_direct(scene, lights, params, media), m_limits(limits),
-          m_media(media.any), m_segments(media.any && params.segments),
-          m_all_segments(params.all_segments),
+          m_media(media.any), m_segments(media.homogeneous),
           m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr) {}
 
     /// Radiance along a ray from the camera, and whether it met anything
@@ -125,13 +124,12 @@ private:
 
     void step(State &s) const {
         Piece piece = fly(s);
-        if (m_segments)
-            add_segment_light(s, piece);
-
         // A segment's light is done, whatever the flight: so the surface behind is seen, too
         Mask surface = s.active && (!piece.scattered || piece.segment);
         SurfaceInteraction3f si =
             s.pi.compute_surface_interaction(s.ray, +mitsuba::RayFlags::All, surface);
+        if (m_segments)
+            add_segment_light(s, si, piece);
         if (m_sees_lights)
             add_emission(s, si, piece, surface);
         surface &= si.is_valid();
@@ -204,10 +202,8 @@ private:
 
     /// Is this a piece whose single scattering is estimated as a whole?
     void find_segment(const State &s, Piece &piece, Mask within) const {
-        piece.segment = within && s.medium->is_homogeneous() &&
-                        s.medium->use_emitter_sampling() && !is_last(s);
-        if (!m_all_segments)
-            piece.segment &= s.depth == 0u;
+        piece.segment             = within && s.medium->is_homogeneous() &&
+                                    s.medium->use_emitter_sampling() && !is_last(s);
         UnpolarizedSpectrum sigma = piece.inside.mei.combined_extinction;
         dr::masked(piece.seen, piece.segment) =
             dr::exp(-dr::minimum(s.pi.t, dr::Largest<Float>) * sigma);
@@ -236,17 +232,17 @@ private:
     }
 
     /// Single scattering along a whole piece of the path, whatever its flight
-    void add_segment_light(State &s, Piece &piece) const {
+    void add_segment_light(State &s, const SurfaceInteraction3f &behind,
+                           Piece &piece) const {
         Mask active = s.active && piece.segment;
         if (dr::none_or<false>(active))
             return;
-        InMedium along       = piece.inside;
-        along.here           = active;
-        along.length         = dr::select(active, s.pi.t, 0.f);
-        const auto si        = dr::zeros<SurfaceInteraction3f>();
-        const BSDFPtr bsdf   = dr::zeros<BSDFPtr>();
-        Vertex vertex        = m_direct.prepare(si, bsdf, &along, draw_sample(s, true),
-                                                plain(s.depth == 0u), active);
+        InMedium along        = piece.inside;
+        along.here            = active;
+        along.length          = dr::select(active, s.pi.t, 0.f);
+        const BSDFPtr no_bsdf = nullptr;
+        Vertex vertex         = m_direct.prepare_segment(
+            behind, no_bsdf, along, draw_sample(s, true), plain(s.depth == 0u), active);
         piece.along          = vertex.at;
         piece.u_tree         = vertex.u.tree;
         piece.along.distance = plain(piece.inside.mei.t);
@@ -318,7 +314,7 @@ private:
         s.from                      = dr::select(plain(leaves), at, s.from);
         s.from.glossy               = vertex.at.glossy;
         s.from.media                = vertex.at.media;
-        s.from.segments             = m_segments;
+        s.from.extent               = m_segments ? Extent::Either : Extent::Point;
         s.u_tree                    = dr::select(leaves, u_tree, s.u_tree);
         s.pdf                       = dr::select(leaves, dr::detach(next.pdf), s.pdf);
         s.specular                  = dr::select(leaves, next.specular, s.specular);
@@ -415,7 +411,7 @@ private:
     const Scene *m_scene;
     DirectLight m_direct;
     PathLimits m_limits;
-    bool m_media, m_segments, m_all_segments, m_sees_lights;
+    bool m_media, m_segments, m_sees_lights;
 };
 
 } // namespace manylights

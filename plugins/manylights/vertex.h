@@ -67,16 +67,17 @@ template <typename Float, typename Spectrum> struct Vertex {
 
     Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
            const LightSample<Float> &u, const Effort<FloatD> &effort, bool glossy,
-           bool segments, Mask active)
+           Extent extent, Mask active)
         : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort) {
         Mask surface = on_surface(active);
-        at           = dr::any_or<true>(surface) ? Reader::read(si, bsdf, glossy, surface)
-                                                 : dr::zeros<Receiver<FloatD>>();
+        at           = extent == Extent::Point && dr::any_or<true>(surface)
+                           ? Reader::read(si, bsdf, glossy, surface)
+                           : dr::zeros<Receiver<FloatD>>();
         if (inside)
             Reader::add_medium(at, *inside, active);
-        at.glossy   = glossy;
-        at.media    = inside != nullptr;
-        at.segments = inside && segments;
+        at.glossy = glossy;
+        at.media  = inside != nullptr;
+        at.extent = extent;
     }
 
     Mask on_surface(Mask active) const {
@@ -102,7 +103,7 @@ template <typename Float, typename Spectrum> struct Vertex {
         std::pair<Spectrum, Float> result(0.f, 0.f);
         mitsuba::BSDFContext ctx;
         Mask surface = on_surface(active);
-        if (dr::any_or<true>(surface)) {
+        if (at.extent == Extent::Point && dr::any_or<true>(surface)) {
             Vector3f wo = si.to_local(d);
             if (with_pdf)
                 result = bsdf->eval_pdf(ctx, si, wo, surface);
