@@ -38,7 +38,9 @@ def fog_open(
 
     Args:
         n_lights: number of lights, 1 to 1,000,000; total power and area stay the same.
-        kind: ``points``, or ``mesh``: triangles of one mesh that shine down, in pairs.
+        kind: ``points``, or ``mesh``: triangles of one mesh that shine down, in pairs. The air
+            close to a point is bright without bound: Mitsuba's ``volpath`` gets bright pixels
+            there, and comparisons of means need ``mesh``.
         mean_free_path: of light in the fog, in metres, above 0.
         g: mean cosine of the angle by which droplets scatter, above -1, below 1; 0 is isotropic.
         seed: of the random numbers.
