@@ -4,7 +4,8 @@
 
 writes `tests/references/NAME.exr`, and `NAME-1.exr` for a second sensor. A file holds the means of
 blocks of 8 x 8 pixels and, below them, their standard errors. The references do not depend on the
-light tree: Mitsuba's `direct` renders them, or a replacement where `direct` is wrong.
+light tree: Mitsuba's `direct`, `path` or `volpath` renders them, or a replacement where `direct` is
+wrong.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from manylights import loading
 
 from tests import statistics_tools as tools
 from tests.exhaustive import make_exhaustive
@@ -41,15 +43,19 @@ WITHOUT_AREA_SAMPLING = {"curves"}
 WITHOUT_SYMBOLIC_CALLS = {"timed_sky"}
 """Scenes with emitters that need evaluated calls in `direct`."""
 
+PATHS = {"interior": "path", "fog": "volpath", "glass_fog": "volpath", "heterogeneous": "volpath"}
+"""Scenes with light after several bounces or in media, and the integrator of their references."""
+
 
 def scene_names():
     """Names of all scenes."""
     return sorted(path.stem for path in SCENE_FOLDER.glob("*.xml"))
 
 
-def load_scene(name):
-    """Load a scene with the size of the references."""
-    return mi.load_file(str(SCENE_FOLDER / f"{name}.xml"), resx=WIDTH, resy=HEIGHT)
+def load_scene(name, integrator="keep"):
+    """Load a scene with the size of the references, and another integrator if one is named."""
+    size = {"resx": str(WIDTH), "resy": str(HEIGHT)}
+    return loading.load(str(SCENE_FOLDER / f"{name}.xml"), size, integrator).scene
 
 
 def load_without_area_lights(name):
@@ -86,6 +92,8 @@ def rendered_blocks(scene, integrator, sensor):
 
 def reference_blocks(name, sensor):
     """Block means of one reference rendering per seed."""
+    if name in PATHS:
+        return rendered_blocks(load_scene(name, PATHS[name]), None, sensor)
     if name in BSDF_ONLY:
         return rendered_blocks(load_scene(name), direct(emitter_samples=0), sensor)
     if name in WITHOUT_AREA_SAMPLING:
@@ -125,11 +133,10 @@ def main():
     parser.add_argument("names", nargs="*", metavar="NAME", help="scenes (default: all)")
     names = parser.parse_args().names or scene_names()
     mi.set_variant("llvm_ad_rgb")
-    import manylights  # noqa: F401  (the scenes name its integrator)
-
     for name in names:
         start = time.perf_counter()
-        for sensor in range(len(load_scene(name).sensors())):
+        sensors = len(load_scene(name, PATHS.get(name, "keep")).sensors())
+        for sensor in range(sensors):
             write_reference(reference_path(name, sensor), reference_blocks(name, sensor))
         print(f"{name}: {time.perf_counter() - start:.0f} s")
 

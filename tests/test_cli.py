@@ -12,7 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import __version__, loading, rendering
+from manylights import __version__, integrators, loading, rendering
+from manylights.errors import UsageError
 from manylights.loading import has_backend
 from manylights.progress import Estimate, format_seconds
 
@@ -45,6 +46,16 @@ DIRECT = """<scene version="3.0.0">
 """
 
 
+#: Parameters of Mitsuba's path tracers, as XML.
+PATH_PARAMETERS = """
+    <integer name="max_depth" value="6"/>
+    <integer name="rr_depth" value="3"/>
+    <boolean name="hide_emitters" value="true"/>
+    <integer name="block_size" value="16"/>
+"""
+FOG = '<medium type="homogeneous" id="fog"/>'
+
+
 def manylights(*arguments, **options):
     """Run the command; return the finished process with its output as text."""
     command = [sys.executable, "-m", "manylights", *map(str, arguments)]
@@ -75,11 +86,40 @@ def render(scene, out, *arguments):
     return result
 
 
-def test_plugin_dir_holds_the_plugin():
+@pytest.fixture
+def choose(tmp_path):
+    """A function that chooses the integrator of a scene without making it.
+
+    It takes XML and what `integrators.choose` takes; it returns the plugin's name, its parameters
+    and the log.
+    """
+    mi.set_variant("scalar_rgb")
+
+    def run(text, wanted=None, **settings):
+        path = tmp_path / "chosen.xml"
+        path.write_text(f'<scene version="3.0.0">{text}</scene>')
+        _, state = loading.parse(str(path), {})
+        notes = integrators.choose(state, wanted, settings)
+        leaves = integrators.leaf_integrators(state)
+        if not leaves:
+            return None, {}, notes
+        props = leaves[0].props
+        return props.plugin_name(), dict(props.items()), notes
+
+    return run
+
+
+def integrator(plugin, parameters=""):
+    """An integrator as XML."""
+    return f'<integrator type="{plugin}">{parameters}</integrator>'
+
+
+@pytest.mark.parametrize("name", ["manylights_direct", "manylights_volpath"])
+def test_plugin_dir_holds_the_plugins(name):
     result = manylights("plugin-dir")
     assert result.returncode == 0
     folder = Path(result.stdout.strip()) / "plugins"
-    assert any(path.stem == "manylights_direct" for path in folder.iterdir())
+    assert any(path.stem == name for path in folder.iterdir())
 
 
 def test_mitsuba_command_finds_the_plugin(tmp_path):
@@ -143,6 +183,147 @@ def test_nested_direct_is_replaced_and_channels_are_kept(tmp_path):
     assert {"R", "G", "B", "depth.T", "normal.X"} <= set(fields)
 
 
+@pytest.mark.parametrize("old", ["path", "volpath"])
+def test_path_tracers_are_replaced_with_their_parameters(choose, old):
+    name, parameters, notes = choose(integrator(old, PATH_PARAMETERS))
+    assert name == "manylights_volpath"
+    assert parameters == {"max_depth": 6, "rr_depth": 3, "hide_emitters": True, "block_size": 16}
+    assert len(notes) == 1
+    assert f"{old} replaced by manylights_volpath with max_depth=6" in notes[0]
+    assert "keep" in notes[0] and "dropped" not in notes[0]
+
+
+@pytest.mark.parametrize("old", ["path", "volpath", "volpathmis", "direct"])
+def test_keep_changes_nothing(choose, old):
+    name, parameters, notes = choose(integrator(old), "keep")
+    assert (name, parameters, notes) == (old, {}, [])
+
+
+@pytest.mark.parametrize("old", ["volpathmis", "depth", "manylights_direct", "manylights_volpath"])
+def test_other_integrators_stay(choose, old):
+    name, parameters, notes = choose(integrator(old))
+    assert (name, parameters) == (old, {})
+    assert notes[0].startswith(f"integrator: {old}")
+    assert ("no spectral MIS" in notes[0]) == (old == "volpathmis")
+
+
+def test_scene_without_integrator_gets_paths_with_the_tree(choose):
+    name, parameters, notes = choose("")
+    assert (name, parameters) == ("manylights_volpath", {})
+    assert "names none, using manylights_volpath" in notes[0] and "keep" in notes[0]
+
+
+def test_scene_without_integrator_can_be_kept(choose):
+    name, _, notes = choose("", "keep")
+    assert name is None
+    assert "Mitsuba uses path" in notes[0]
+    with pytest.raises(UsageError, match="choose one with --integrator"):
+        choose("", "keep", max_depth=2)
+
+
+def test_settings_reach_the_integrator_of_a_scene_without_one(choose):
+    _, parameters, _ = choose("", max_depth=3, splitting_rate=2.0)
+    assert parameters == {"max_depth": 3, "splitting_rate": 2.0}
+
+
+@pytest.mark.parametrize("text", ["", integrator("path")])
+def test_media_that_path_ignores_are_mentioned(choose, text):
+    assert any("which path ignores" in note for note in choose(text + FOG)[2])
+    assert not any("ignores" in note for note in choose(text)[2])
+
+
+def test_media_of_volpath_need_no_mention(choose):
+    assert not any("ignores" in note for note in choose(integrator("volpath") + FOG)[2])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "kept", "dropped"),
+    [
+        ("path", "manylights_direct", {"hide_emitters", "block_size"}, "max_depth, rr_depth"),
+        ("path", "volpath", {"max_depth", "rr_depth", "hide_emitters", "block_size"}, None),
+        ("path", "ptracer", {"hide_emitters"}, "max_depth, rr_depth, block_size"),
+        (
+            "volpathmis",
+            "manylights_volpath",
+            {"max_depth", "rr_depth", "hide_emitters", "block_size"},
+            None,
+        ),
+    ],
+)
+def test_named_integrator_keeps_what_means_the_same(choose, old, new, kept, dropped):
+    name, parameters, notes = choose(integrator(old, PATH_PARAMETERS), new)
+    assert name == new
+    assert set(parameters) == kept
+    assert notes[0].partition("dropped ")[2] == (dropped or "")
+
+
+def test_ours_replace_each_other_and_keep_the_tree(choose):
+    tree = '<float name="splitting_rate" value="2"/><integer name="shadow_rays" value="3"/>'
+    bsdf = '<integer name="bsdf_samples" value="2"/>'
+    name, parameters, notes = choose(
+        integrator("manylights_direct", tree + bsdf), "manylights_volpath"
+    )
+    assert name == "manylights_volpath"
+    assert parameters == {"splitting_rate": 2.0, "shadow_rays": 3}
+    assert "dropped bsdf_samples" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("plugin", "wrong", "listed"),
+    [
+        ("manylights_direct", "max_depth", "bsdf_samples (integer"),
+        ("manylights_volpath", "bsdf_samples", "max_depth (integer"),
+    ],
+)
+def test_unknown_parameters_are_refused_with_those_of_the_integrator(choose, plugin, wrong, listed):
+    for text in (integrator(plugin), integrator("path")):
+        with pytest.raises(UsageError) as raised:
+            choose(text, plugin, **{wrong: 1})
+        assert f"--set {wrong}: {plugin} has no such parameter" in str(raised.value)
+        assert listed in str(raised.value) and f"{wrong} (" not in str(raised.value)
+
+
+@pytest.mark.parametrize("plugin", ["manylights_direct", "manylights_volpath"])
+def test_listed_parameters_are_those_of_the_plugin(plugin):
+    """The plugin accepts all that the help lists, and the defaults are those it states."""
+    mi.set_variant("scalar_rgb")
+    for name, meaning in integrators.PARAMETERS[plugin].items():
+        default = integrators.parse_value(meaning.rpartition("default ")[2].split(",")[0])
+        needed = {"method": "talk"} if name == "split_function" else {}
+        untouched = mi.load_dict({"type": plugin, **needed})
+        assert str(mi.load_dict({"type": plugin, name: default, **needed})) == str(untouched)
+
+
+@pytest.mark.parametrize("plugin", ["manylights_direct", "manylights_volpath"])
+def test_parameters_of_the_tree_are_found(tmp_path, plugin):
+    mi.set_variant("scalar_rgb")
+    path = tmp_path / "scene.xml"
+    hidden = '<boolean name="hide_emitters" value="true"/>'
+    parameters = f'<float name="splitting_rate" value="2"/>{hidden}'
+    path.write_text(f'<scene version="3.0.0">{integrator(plugin, parameters)}</scene>')
+    _, state = loading.parse(str(path), {})
+    assert integrators.ours_in(state) == (plugin, {"splitting_rate": 2.0})
+
+
+def test_help_lists_the_parameters_of_both_plugins():
+    text = manylights("render", "--help").stdout
+    for plugin, parameters in integrators.PARAMETERS.items():
+        table = text.partition(f"parameters of {plugin}:")[2]
+        assert all(f"  {name} " in table for name in parameters)
+
+
+@pytest.mark.parametrize("old", ["path", "volpath", None])
+def test_paths_are_rendered_with_the_tree(tmp_path, old):
+    """The command renders a scene of a path tracer, or without integrator, with the plugin."""
+    start, end = DIRECT.index("<integrator"), DIRECT.index("<sensor")
+    text = integrator(old, '<integer name="max_depth" value="3"/>') if old else ""
+    path = tmp_path / "scene.xml"
+    path.write_text(DIRECT[:start] + text + DIRECT[end:])
+    log = render(path, tmp_path / "out.exr", "--set", "shadow_rays=2").stderr
+    assert "manylights_volpath" in log
+    assert np.array(mi.Bitmap(str(tmp_path / "out.exr"))).mean() > 0
+
+
 def test_scene_parameters_are_set(scene, tmp_path):
     means = []
     for value in (1, 2):
@@ -172,6 +353,13 @@ def test_tree_as_json():
 def test_tree_leaves_the_environment_out():
     tree = json.loads(manylights("tree", SCENES / "constant.xml", "--json").stdout)
     assert (tree["lights"], tree["lights_in_tree"]) == (3, 2)
+
+
+def test_tree_of_an_integrator_for_paths():
+    result = manylights("tree", SCENES / "interior.xml", "--json")
+    assert result.returncode == 0, result.stderr
+    tree = json.loads(result.stdout)
+    assert tree["lights"] == tree["lights_in_tree"] > 0
 
 
 def test_tree_as_text():

@@ -1,4 +1,4 @@
-"""Each scene in `scenes/` still looks as its reference image, which Mitsuba's `direct` rendered.
+"""Each scene in `scenes/` still looks as its reference image, which Mitsuba's integrators rendered.
 
 `tests/README.md` says how the references are made. A failure writes a picture of the difference.
 """
@@ -27,8 +27,9 @@ pytestmark = pytest.mark.usefixtures("plugin")
 TEST_SEEDS = range(1000, 1016)
 SAMPLES = 16
 
-# The camera looks at hundreds of small, bright bulbs: their borders are most of the noise.
-SAMPLES_OF = {"many_bulbs": 64}
+# The camera looks at hundreds of small, bright bulbs: their borders are most of the noise. In fog,
+# it is the lamps close by, and the glass, through which light is found by chance only.
+SAMPLES_OF = {"many_bulbs": 64, "fog": 32, "glass_fog": 64, "heterogeneous": 32}
 BIAS_OF = {"many_bulbs": 0.05, "no_lights": None}
 
 

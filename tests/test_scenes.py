@@ -77,7 +77,7 @@ def test_same_seed_same_scene(scalar, name):
     assert fingerprint(generate(seed=3)) == fingerprint(generate(seed=3))
 
 
-@pytest.mark.parametrize("name", ["city", "bulbs", "rooms", "glossy", "open_plane"])
+@pytest.mark.parametrize("name", ["city", "bulbs", "rooms", "glossy", "open_plane", "fog_open"])
 def test_other_seed_other_scene(scalar, name):
     generate = getattr(scenes, name)
     assert fingerprint(generate(seed=3)) != fingerprint(generate(seed=4))
@@ -94,11 +94,14 @@ def test_powers_of_the_city_span_decades(scalar):
     assert luminance.max() / luminance.min() > 1e3
 
 
-def test_radiance_is_the_same_in_a_texture_as_in_an_attribute(scalar):
+@pytest.mark.parametrize(
+    ("name", "arguments"), [("city", {}), ("rooms", {}), ("fog_open", {"kind": "mesh"})]
+)
+def test_radiance_is_the_same_in_a_texture_as_in_an_attribute(scalar, name, arguments):
     images = []
     for texture in (False, True):
-        description = scenes.city(
-            3000, texture=texture, width=48, height=27, spp=8, integrator="direct"
+        description = getattr(scenes, name)(
+            3000, texture=texture, width=48, height=27, spp=8, integrator="direct", **arguments
         )
         # BSDF sampling alone, which Mitsuba supports for both.
         description["integrator"].update(emitter_samples=0, bsdf_samples=1)
@@ -115,6 +118,51 @@ def test_generated_scenes_render(each_variant, name):
     assert image.mean() > 0
 
 
+FOGGY = {
+    "fog_open": {"kind": "mesh", "texture": True},
+    "fog_street": {"texture": True},
+    "fog_rooms": {"texture": True},
+}
+"""Scenes in fog in the form that Mitsuba's own integrators handle."""
+
+
+@pytest.mark.parametrize("name", FOGGY)
+def test_mitsuba_renders_the_fog(each_variant, name):
+    description = getattr(scenes, name)(
+        40, **FOGGY[name], width=24, height=16, spp=4, integrator="volpath"
+    )
+    image = np.array(mi.render(mi.load_dict(description)))
+    assert np.isfinite(image).all()
+    assert image.mean() > 0
+
+
+@pytest.mark.parametrize("name", FOGGY)
+def test_camera_and_lights_are_in_the_fog(scalar, name):
+    description = getattr(scenes, name)(200, integrator="volpath", **FOGGY[name])
+    assert description["sensor"]["medium"] == description["fog_box"]["interior"]
+    scene = mi.load_dict(description)
+    (box,) = [shape for shape in scene.shapes() if shape.interior_medium() is not None]
+    low, high = np.array(box.bbox().min), np.array(box.bbox().max)
+    camera = np.array(scene.sensors()[0].world_transform() @ mi.ScalarPoint3f(0))
+    places = [emitter.get_shape().bbox() for emitter in scene.emitters()]
+    corners = [camera, *(np.array(end) for place in places for end in (place.min, place.max))]
+    assert (low < corners).all() and (corners < high).all()
+
+
+def test_thin_fog_changes_little_and_dense_fog_hides_all(scalar):
+    """Fog of a mean free path of kilometres is air; of centimetres, what is seen is fog."""
+    options = {"integrator": {"type": "volpath", "max_depth": 2}, "width": 24, "height": 16}
+    images = []
+    for description in (
+        scenes.rooms(40, texture=True, **options),
+        scenes.fog_rooms(40, mean_free_path=1e6, texture=True, **options),
+        scenes.fog_rooms(40, mean_free_path=0.01, texture=True, **options),
+    ):
+        images.append(np.array(mi.render(mi.load_dict(description), spp=256)).mean())
+    assert images[1] == pytest.approx(images[0], rel=0.1)
+    assert images[2] < 0.01 * images[0]
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -125,6 +173,9 @@ def test_generated_scenes_render(each_variant, name):
         (lambda: scenes.glossy(10, roughness=0.0), "roughness"),
         (lambda: scenes.narrow_spots(10, cutoff=90.0), "cutoff"),
         (lambda: scenes.rooms(10, per_room=0), "per_room"),
+        (lambda: scenes.fog_open(10, kind="quads"), "points, mesh"),
+        (lambda: scenes.fog_open(10, mean_free_path=0.0), "mean_free_path"),
+        (lambda: scenes.fog_rooms(10, g=1.0), "g=1.0"),
     ],
 )
 def test_wrong_arguments_are_named(scalar, call, words):
@@ -168,7 +219,7 @@ def test_readme_lists_every_file():
 def test_files_are_small(path):
     lines = path.read_text().splitlines()
     assert len(lines) < 200
-    assert 'type="manylights_direct"' in path.read_text()
+    assert 'type="manylights_' in path.read_text()
     assert '<default name="spp"' in path.read_text()
 
 

@@ -77,14 +77,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_render(commands, common) -> None:
-    from manylights.integrators import PARAMETERS
-
-    known = "; ".join(f"{name}: {meaning}" for name, meaning in PARAMETERS.items())
     render = commands.add_parser(
         "render",
         parents=[common],
         help="render an XML scene",
         description=RENDER_HELP,
+        epilog=_parameter_help(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     render.add_argument("scene", metavar="SCENE.xml")
@@ -96,19 +94,30 @@ def _add_render(commands, common) -> None:
     render.add_argument(
         "--integrator",
         metavar="NAME",
-        help="keep: the scene's own; any other name: that plugin "
-        "(default: manylights_direct instead of direct, any other stays)",
+        help="keep: the scene's own; any other name: that plugin (default: manylights_direct "
+        "instead of direct, manylights_volpath instead of path, volpath or none, any other stays)",
     )
     render.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help=f"set a parameter of the integrator, any number of times ({known})",
+        help="set a parameter of the integrator, any number of times (see below)",
     )
     _add_define(render)
     _add_machine(render)
     render.set_defaults(command=_render)
+
+
+def _parameter_help() -> str:
+    """Return the parameters of our integrators as a table for the help."""
+    from manylights.integrators import PARAMETERS
+
+    lines = []
+    for plugin, parameters in PARAMETERS.items():
+        lines += ["", f"parameters of {plugin}:"]
+        lines += [f"  {name:<14}  {meaning}" for name, meaning in parameters.items()]
+    return "\n".join(lines[1:])
 
 
 def _add_tree(commands, common) -> None:
@@ -255,7 +264,7 @@ def _demo(options) -> None:
         width=options.width,
         height=options.height,
         spp=spp,
-        integrator={"type": integrators.OURS, "block_size": integrators.BLOCK_SIZE},
+        integrator={"type": integrators.DIRECT, "block_size": integrators.BLOCK_SIZE},
     )
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
     lights = sum(tree.count_kinds(loaded.scene).values())

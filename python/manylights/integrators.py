@@ -1,4 +1,4 @@
-"""Chooses the integrator of a parsed scene: replaces Mitsuba's ``direct`` by ours, sets parameters.
+"""Chooses the integrator of a parsed scene: replaces Mitsuba's by ours, sets parameters.
 
 The work happens on Mitsuba's parsed form of a scene (``mi.parser.ParserState``), before any object
 exists. The text of the XML file is not touched, and integrators nested in others, as in ``aov``,
@@ -13,24 +13,56 @@ import mitsuba as mi
 
 from manylights.errors import UsageError
 
-OURS = "manylights_direct"
+#: Our plugins: direct light on surfaces, and paths through surfaces and media.
+DIRECT, VOLPATH = "manylights_direct", "manylights_volpath"
 
-#: What the plugin accepts, for error messages and help. The plugin itself checks the values.
-PARAMETERS = {
+#: What both plugins accept to steer the choice of lights.
+SAMPLING_PARAMETERS = {
     "splitting_rate": "float >= 0 or inf, default 1",
-    "reservoirs": "integer >= 1",
-    "shadow_rays": "integer from 1 to the number of reservoirs",
-    "bsdf_samples": "integer >= 0, default 1",
-    "method": "resampled_tree or talk",
-    "hide_emitters": "true or false, default false",
+    "reservoirs": "integer from 1 to 64, default 8",
+    "shadow_rays": "integer from 1 to the number of reservoirs, default 4",
+    "method": "resampled_tree or talk, default resampled_tree",
+    "split_function": "near or far, default near, for method=talk only",
+}
+
+#: What each plugin accepts, for error messages and help. The plugins themselves check the values.
+PARAMETERS = {
+    DIRECT: {
+        **SAMPLING_PARAMETERS,
+        "bsdf_samples": "integer >= 0, default 1",
+        "hide_emitters": "true or false, default false",
+    },
+    VOLPATH: {
+        "max_depth": "integer, -1 for no limit, default -1",
+        "rr_depth": "integer >= 1, default 5",
+        **SAMPLING_PARAMETERS,
+        "hide_emitters": "true or false, default false",
+    },
 }
 
 #: Parameters of Mitsuba's own base classes, accepted too.
-BASE_PARAMETERS = ("block_size", "timeout")
+BASE_PARAMETERS = ("block_size", "samples_per_pass", "timeout")
 
 #: Integrators that render an image in blocks, and Mitsuba's own size of them, in pixels.
-USING_BLOCKS = (OURS, "aov", "depth", "direct", "moment", "path", "stokes", "volpath", "volpathmis")
+USING_BLOCKS = (
+    *(DIRECT, VOLPATH),
+    *("aov", "depth", "direct", "moment", "path", "stokes", "volpath", "volpathmis"),
+)
 BLOCK_SIZE = 32
+
+#: What becomes of Mitsuba's integrators if nobody says otherwise. All others stay.
+REPLACEMENTS = {"direct": DIRECT, "path": VOLPATH, "volpath": VOLPATH}
+
+#: Parameters, and the integrators in which they mean the same.
+SHARED_PARAMETERS = (
+    (("max_depth", "rr_depth"), ("path", "volpath", "volpathmis", VOLPATH)),
+    (tuple(SAMPLING_PARAMETERS), (DIRECT, VOLPATH)),
+    (("bsdf_samples",), ("direct", DIRECT)),
+    (BASE_PARAMETERS, USING_BLOCKS),
+)
+
+#: Why an integrator stays that one of ours could replace.
+STAYS = {"volpathmis": f" stays: {VOLPATH} has no spectral MIS (--integrator {VOLPATH} uses it)"}
 
 
 def parse_value(text: str) -> bool | int | float | str:
@@ -69,26 +101,25 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
 
     Args:
         state: the scene as ``mi.parser.parse_file`` returns it, before any transformation.
-        wanted: ``None`` replaces ``direct`` by ``manylights_direct``; ``"keep"`` replaces nothing;
-            any other text is the plugin to use for every integrator that nests no other.
+        wanted: ``None`` replaces as ``REPLACEMENTS`` says, and ``path``, which Mitsuba uses if the
+            scene names no integrator, like the others; ``"keep"`` replaces nothing; any other text
+            is the plugin to use for every integrator that nests no other.
         settings: parameters to set on each of those integrators.
 
     Returns:
         Lines for the log, each a statement of what was replaced, dropped or kept.
 
     Raises:
-        UsageError: ``settings`` has a name that ``manylights_direct`` does not know, or there is no
-            integrator to set it on.
+        UsageError: ``settings`` has a name that our plugin does not know, or there is no integrator
+            to set it on.
     """
     leaves = leaf_integrators(state)
     notes = []
     if not leaves:
         leaves, notes = _without_integrator(state, wanted)
-    for node in leaves:
-        if wanted is None:
-            notes.extend(_replace_direct(node.props))
-        elif wanted != "keep":
-            notes.extend(_replace(node.props, wanted))
+    elif wanted != "keep":
+        for node in leaves:
+            notes.extend(_replace(state, node.props, wanted))
     if settings and not leaves:
         raise UsageError("--set: the scene has no integrator, choose one with --integrator NAME")
     for node in leaves:
@@ -114,12 +145,17 @@ def leaf_integrators(state) -> list:
     return [node for node in integrators if not _nests_integrator(node, state)]
 
 
-def parameters_of_ours(state) -> dict[str, Any]:
-    """Return the parameters of the first ``manylights_direct`` of a parsed scene, {} if none."""
+def ours_in(state) -> tuple[str, dict[str, Any]]:
+    """Return the first plugin of ours in a parsed scene and the parameters that concern its tree.
+
+    A scene without any has ``manylights_direct`` with default parameters.
+    """
     for node in leaf_integrators(state):
-        if node.props.plugin_name() == OURS:
-            return {name: value for name, value in node.props.items() if name in PARAMETERS}
-    return {}
+        name = node.props.plugin_name()
+        if name in PARAMETERS:
+            items = node.props.items()
+            return name, {key: value for key, value in items if key in SAMPLING_PARAMETERS}
+    return DIRECT, {}
 
 
 def _nests_integrator(node, state) -> bool:
@@ -140,64 +176,86 @@ def _nests_integrator(node, state) -> bool:
 
 def _without_integrator(state, wanted: str | None) -> tuple[list, list[str]]:
     """Handle a scene that names no integrator; Mitsuba would use ``path``."""
-    if wanted in (None, "keep"):
+    if wanted == "keep":
         return [], ["integrator: the scene names none, Mitsuba uses path"]
+    chosen = wanted or REPLACEMENTS["path"]
     node = mi.parser.SceneNode()
     node.type = mi.ObjectType.Integrator
-    node.props = mi.Properties(wanted)
+    node.props = mi.Properties(chosen)
     state.nodes.append(node)
     index = len(state.nodes) - 1
     state.root.props["_arg_integrator"] = mi.Properties.ResolvedReference(index)
-    return [state.nodes[index]], [f"integrator: the scene names none, using {wanted}"]
+    note = f"integrator: the scene names none, using {chosen}{_undo(wanted)}"
+    return [state.nodes[index]], [note, *_about_media(state, "path", chosen)]
 
 
-def _replace_direct(props) -> list[str]:
-    """Turn Mitsuba's ``direct`` into ours with the same meaning, any other stays as it is."""
-    name = props.plugin_name()
-    if name != "direct":
-        return [f"integrator: {name}"]
+def _replace(state, props, wanted: str | None) -> list[str]:
+    """Turn an integrator into ``wanted``, ``None`` for what ``REPLACEMENTS`` says.
+
+    Parameters that mean the same in both are kept, the others are dropped and named.
+    """
+    old = props.plugin_name()
+    new = wanted or REPLACEMENTS.get(old, old)
+    if old == new:
+        stays = STAYS.get(old, "") if wanted is None else ""
+        return [f"integrator: {old}{_listed(props)}{stays}"]
+    notes = []
+    if (old, new) == ("direct", DIRECT):
+        if props.get("emitter_samples", props.get("shading_samples", 1)) == 0:
+            return ["integrator: direct stays, emitter_samples=0 asks for BSDF sampling alone"]
+        notes = _translate_samples(props)
+    dropped = [key for key, _ in props.items() if not _means_the_same(key, old, new)]
+    for key in dropped:
+        del props[key]
+    props.set_plugin_name(new)
+    lost = f", dropped {', '.join(dropped)}" if dropped else ""
+    note = f"integrator: {old} replaced by {new}{_listed(props)}{lost}{_undo(wanted)}"
+    return [note, *notes, *_about_media(state, old, new)]
+
+
+def _undo(wanted: str | None) -> str:
+    return " (--integrator keep undoes it)" if wanted is None else ""
+
+
+def _means_the_same(parameter: str, old: str, new: str) -> bool:
+    if parameter == "hide_emitters":
+        return True
+    shared = (plugins for names, plugins in SHARED_PARAMETERS if parameter in names)
+    return any(old in plugins and new in plugins for plugins in shared)
+
+
+def _translate_samples(props) -> list[str]:
+    """Turn the numbers of samples of Mitsuba's ``direct`` into those of ours."""
     shading = props.get("shading_samples", 1)
     emitter_samples = props.get("emitter_samples", shading)
     bsdf_samples = props.get("bsdf_samples", shading)
-    if emitter_samples == 0:
-        return ["integrator: direct stays, emitter_samples=0 asks for BSDF sampling alone"]
     for key in ("shading_samples", "emitter_samples", "bsdf_samples"):
         if key in props:
             del props[key]
     if bsdf_samples != 1:
         props["bsdf_samples"] = bsdf_samples
-    props.set_plugin_name(OURS)
-    notes = [f"integrator: direct replaced by {OURS}{_listed(props)} (--integrator keep undoes it)"]
-    if emitter_samples != 1:
-        notes.append(
-            f"integrator: emitter_samples={emitter_samples} has no counterpart, "
-            "set shadow_rays and reservoirs with --set instead"
-        )
-    return notes
+    if emitter_samples == 1:
+        return []
+    return [
+        f"integrator: emitter_samples={emitter_samples} has no counterpart, "
+        "set shadow_rays and reservoirs with --set instead"
+    ]
 
 
-def _replace(props, wanted: str) -> list[str]:
-    """Turn an integrator into ``wanted``; of its parameters only ``hide_emitters`` means the same
-    everywhere, the others are dropped and named."""
-    old = props.plugin_name()
-    if old == wanted:
-        return [f"integrator: {wanted}{_listed(props)}"]
-    if (old, wanted) == ("direct", OURS):
-        return _replace_direct(props)
-    dropped = [key for key, _ in props.items() if key != "hide_emitters"]
-    for key in dropped:
-        del props[key]
-    props.set_plugin_name(wanted)
-    note = f"integrator: {old} replaced by {wanted}{_listed(props)}"
-    return [note + (f", dropped {', '.join(dropped)}" if dropped else "")]
+def _about_media(state, old: str, new: str) -> list[str]:
+    """Say so if the image changes since the old integrator ignores the scene's media."""
+    has_media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
+    if (old, new) != ("path", VOLPATH) or not has_media:
+        return []
+    return [f"integrator: the scene has media, which {old} ignores and {new} renders"]
 
 
 def _apply(props, settings: dict[str, Any]) -> None:
-    allowed = (*PARAMETERS, *BASE_PARAMETERS)
+    plugin = props.plugin_name()
     for name, value in settings.items():
-        if props.plugin_name() == OURS and name not in allowed:
-            known = "; ".join(f"{key} ({meaning})" for key, meaning in PARAMETERS.items())
-            raise UsageError(f"--set {name}: {OURS} has no such parameter. It has: {known}")
+        if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
+            known = "; ".join(f"{key} ({what})" for key, what in PARAMETERS[plugin].items())
+            raise UsageError(f"--set {name}: {plugin} has no such parameter. It has: {known}")
         props[name] = value
 
 

@@ -122,7 +122,8 @@ def load(
     Args:
         path: the XML file.
         defines: values for the scene's ``<default>`` parameters. Default: none.
-        integrator: ``None`` (``direct`` becomes ours), ``"keep"`` or a plugin's name.
+        integrator: ``None`` (``direct``, ``path`` and ``volpath`` become ours), ``"keep"`` or a
+            plugin's name.
         settings: parameters to set on the integrator. Default: none.
     """
     with search_beside(path), threads_for_files():

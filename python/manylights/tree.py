@@ -29,7 +29,8 @@ KINDS = {
 def describe(path: str, defines: dict[str, str] | None = None) -> dict:
     """Build the light tree of an XML scene and return what it is like.
 
-    The parameters of the scene's ``manylights_direct``, if it has one, decide which tree is built.
+    If the scene names an integrator of ours, it builds the tree, with those of its parameters that
+    concern the tree; otherwise ``manylights_direct`` does, with default parameters.
 
     Args:
         path: the XML file.
@@ -41,9 +42,9 @@ def describe(path: str, defines: dict[str, str] | None = None) -> dict:
     """
     with loading.search_beside(path), threads_for_files():
         config, state = loading.parse(path, defines or {})
-        parameters = integrators.parameters_of_ours(state)
+        plugin, parameters = integrators.ours_in(state)
         scene = loading.instantiate(config, state)
-    integrator = mi.load_dict({"type": integrators.OURS, **parameters})
+    integrator = mi.load_dict({"type": plugin, **parameters})
     integrator.render(scene, sensor=_tiny_sensor(), seed=0, spp=1)
     values = mi.traverse(integrator)
     return {

@@ -21,6 +21,7 @@ from manylights.scenes._adversarial import (
     twelve_decades,
 )
 from manylights.scenes._city import city
+from manylights.scenes._fog import fog_open, fog_rooms, fog_street
 from manylights.scenes._gallery import bulbs, glossy, open_plane, rooms
 
 __all__ = [
@@ -29,6 +30,9 @@ __all__ = [
     "bulbs",
     "city",
     "coincident",
+    "fog_open",
+    "fog_rooms",
+    "fog_street",
     "glossy",
     "names",
     "narrow_spots",

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-OURS = "manylights_direct"
-
 WARM = (1.0, 0.68, 0.36)
 COOL = (0.72, 0.86, 1.0)
 WHITE = (1.0, 0.93, 0.82)

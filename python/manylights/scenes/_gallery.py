@@ -102,6 +102,7 @@ def rooms(
     height: int = 144,
     spp: int = 16,
     integrator="manylights_direct",
+    texture: bool = False,
 ) -> dict:
     """Rooms in a square grid, each with doors to its neighbours and lamps on the ceiling.
 
@@ -114,7 +115,10 @@ def rooms(
         seed: of the random numbers.
         width, height: of the image in pixels.
         spp: samples per pixel.
-        integrator: name of a plugin, or its dictionary.
+        integrator: name of a plugin, or its dictionary. For light that comes through the doors
+            after several bounces: ``{"type": "manylights_volpath", "max_depth": 6}``.
+        texture: store the radiance in a texture instead of a face attribute: Mitsuba's own emitter
+            sampling handles that one only. Default: False.
     """
     n_lights = build.check_count(n_lights)
     if per_room < 1:
@@ -132,7 +136,9 @@ def rooms(
         "ceiling": build.rectangle(
             [0, 0, CEILING], [0, side * ROOM, 0], [side * ROOM, 0, 0], bsdf=build.diffuse(0.7)
         ),
-        "lights": build.glowing_mesh(_ceiling_lamps(rng, count, side, per_room), n_lights),
+        "lights": build.glowing_mesh(
+            _ceiling_lamps(rng, count, side, per_room), n_lights, texture=texture
+        ),
     }
     # The first room is lit even if there is a single light.
     sensor = build.camera(
