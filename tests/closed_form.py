@@ -1,7 +1,7 @@
 """Exact pixel values of a diffuse plane and of fog under point and spot lights, by quadrature.
 
-Nothing here calls Mitsuba, only numpy: the camera, the lights' emission and the reflection are written down
-again, so that a mistake in reading the scene shows as well as one in the sampling.
+Nothing here calls Mitsuba, only numpy: the camera, the lights' emission, reflection and scattering
+are written down again, so that a mistake in reading the scene shows as well as one in the sampling.
 """
 
 from __future__ import annotations
@@ -139,37 +139,85 @@ def rayleigh(cosine):
     return 3 / (16 * np.pi) * (1 + cosine**2)
 
 
-def single_scatter_image(camera, lights, extinction, albedo, phase=isotropic, order=4, nodes=64):
+def tabulated(values):
+    """Phase function that is linear between values at equidistant cosines from -1 to 1."""
+    cosines = np.linspace(-1, 1, len(values))
+    integral = 2 * np.pi * np.trapezoid(values, cosines)
+    return lambda cosine: np.interp(cosine, cosines, values) / integral
+
+
+def blend(weight, first, second):
+    """Mixture of two phase functions; `weight` is that of the second one."""
+    return lambda cosine: (1 - weight) * first(cosine) + weight * second(cosine)
+
+
+class Phase:
+    """Scattering that depends on the deflection only."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def value(self, along, leaving):
+        """Density of scattering from one direction of travel into another one."""
+        return self.function((along * leaving).sum(axis=-1))
+
+    def area(self, direction):
+        """Factor of the extinction for light that travels along a direction."""
+        return np.ones(direction.shape[:-1])
+
+
+class Flakes:
+    """Mirrors whose normals are those of an ellipsoid: the SGGX model of Heitz et al. (2015)."""
+
+    def __init__(self, xx, yy, zz, xy, xz, yz):
+        self.matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
+
+    def area(self, direction):
+        """Area of the flakes, seen along a direction."""
+        return np.sqrt(np.einsum("...i,ij,...j", direction, self.matrix, direction))
+
+    def value(self, along, leaving):
+        """Density of scattering: that of the flakes half-way, seen along the light."""
+        half = normalized(leaving - along)
+        inverse = np.linalg.inv(self.matrix)
+        form = np.einsum("...i,ij,...j", half, inverse, half)
+        density = 1 / (np.pi * np.sqrt(np.linalg.det(self.matrix)) * form**2)
+        return density / (4 * self.area(along))
+
+
+def single_scatter_image(camera, lights, extinction, albedo, phase, order=4, nodes=64):
     """Expected image of light that is scattered once, in fog without bounds or surfaces.
 
     The lights have to be out of the camera's view: near them Gauss's rule would fail.
     """
     directions = camera.directions(*film_grid(camera, order))
-    thinnest = float(np.min(extinction))
-    # The distance follows the density of free paths of the thinnest channel, cut off at e^-20
+    dense = np.array(extinction) * phase.area(directions)[..., np.newaxis]
     share, weights = np.polynomial.legendre.leggauss(nodes)
-    distances = 10 / thinnest * (share + 1) ** 2 / 2
-    weights = weights * 10 / thinnest * (share + 1)
+    # Denser near the camera; cut off at e^-20
+    farthest = 20 / float(np.min(dense))
+    distances = farthest * ((share + 1) / 2) ** 2
+    weights = weights * farthest * (share + 1) / 2
     total = np.zeros((*directions.shape[:-1], 3))
     for distance, weight in zip(distances, weights):
         points = np.array(camera.origin) + distance * directions
-        scattered = weight * transmittance(distance, extinction) * np.array(extinction)
-        total += scattered * albedo * in_scattered(points, directions, lights, extinction, phase)
+        scattered = weight * np.exp(-distance * dense) * dense * np.array(albedo)
+        total += scattered * in_scattered(points, directions, lights, extinction, phase)
     return pixel_means(camera, total, order)
 
 
 def in_scattered(points, directions, lights, extinction, phase):
-    """Radiance of the lights at `points` times the phase function towards the camera."""
+    """Radiance of the lights at `points` times the phase function towards the camera.
+
+    The phase function is that of the reversed path, as a path from the camera samples it.
+    """
     total = np.zeros((*points.shape[:-1], 3))
     for light in lights:
         offset = np.array(light.position) - points
-        distance2 = (offset**2).sum(axis=-1)
+        distance = np.linalg.norm(offset, axis=-1)
         towards = normalized(offset)
-        # The light comes along -towards and leaves along -directions
-        deflection = (towards * directions).sum(axis=-1)
-        arriving = light.falloff(-towards) * phase(deflection) / distance2
-        arriving = arriving[..., np.newaxis] * transmittance(np.sqrt(distance2), extinction)
-        total += arriving * np.array(light.intensity)
+        arriving = light.falloff(-towards) * phase.value(directions, towards) / distance**2
+        length = distance * phase.area(towards)
+        total += arriving[..., np.newaxis] * transmittance(length, extinction) * light.intensity
     return total
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 
 import mitsuba as mi
+import pytest
 
 from tests import path_scenes
 from tests.references import ERROR, planned_images, set_power_weights
@@ -18,8 +19,41 @@ from tests.references import ERROR, planned_images, set_power_weights
 INTEGRATOR = "manylights_volpath"
 """The plugin that all tests of path tracing are about."""
 
+INFINITY = float("inf")
+
+# One-factor variations of the parameters, then combinations of extremes. Later parameters of the
+# plugin belong here.
+PARAMETERS = (
+    {"splitting_rate": 0},
+    {"splitting_rate": 4},
+    {"splitting_rate": INFINITY},
+    {"reservoirs": 1, "shadow_rays": 1},
+    {"reservoirs": 8, "shadow_rays": 2},
+    {"reservoirs": 16, "shadow_rays": 1},
+    {"reservoirs": 16, "shadow_rays": 4},
+    {"splitting_rate": 0, "reservoirs": 1, "shadow_rays": 1},
+    {"splitting_rate": INFINITY, "reservoirs": 4, "shadow_rays": 4},
+)
+METHODS = (
+    {"method": "resampled_tree"},
+    {"method": "talk"},
+    {"method": "talk", "split_function": "far"},
+)
+
 MAX_DEPTH = 4
 """Default path depth of the tests: three bounces."""
+
+
+def parameter_id(parameters):
+    """A readable test id: `reservoirs=4,shadow_rays=1`."""
+    return ",".join(f"{name}={value}" for name, value in parameters.items())
+
+
+def quick_and_slow(values, quick):
+    """Values as parameters of a test; those that are not in `quick` are marked as slow."""
+    return [
+        pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values
+    ]
 
 
 def light_tree(**parameters):
@@ -38,20 +72,20 @@ def depth_of(name):
     return 2 if name in path_scenes.SINGLE_SCATTERING else MAX_DEPTH
 
 
-def plugin_images(name, sensor=0, film=(), **parameters):
+def plugin_images(name, sensor=0, **parameters):
     """Images (seeds, height, width, channels) of the integrator under test."""
-    scene = path_scenes.load(name, **dict(film))
+    scene = path_scenes.load(name)
     integrator = light_tree(**{"max_depth": depth_of(name), **parameters})
     return planned_images(scene, integrator, ERROR["tested"], first_seed=0, sensor=sensor)
 
 
 @functools.cache
-def known_images(name, variant, sensor=0, film=(), **parameters):
+def known_images(name, variant, sensor=0, **parameters):
     """Images of Mitsuba's integrator, rendered in `variant`; restores the current one."""
     before = mi.variant()
     mi.set_variant(variant)
     try:
-        scene = path_scenes.load(name, **dict(film))
+        scene = path_scenes.load(name)
         set_power_weights(scene)
         integrator = known(name, **{"max_depth": depth_of(name), **parameters})
         error = ERROR["uniform"]

@@ -18,7 +18,6 @@ import numpy as np
 from tests.light_scenes import (
     MATERIALS,
     MIRRORS,
-    TINTS,
     area,
     colours,
     diffuse,
@@ -271,12 +270,13 @@ def hg(g):
     return {"type": "hg", "g": g}
 
 
+TABULATED = (0.5, 1.5, 0.2, 0.4, 1.0, 3.0)
 PHASES = {
     "isotropic": lambda: {"type": "isotropic"},
     "hg-forward": lambda: hg(0.7),
     "hg-backward": lambda: hg(-0.5),
     "rayleigh": lambda: {"type": "rayleigh"},
-    "tabphase": lambda: {"type": "tabphase", "values": "0.5, 1.5, 0.2, 0.4, 1.0, 3.0"},
+    "tabphase": lambda: {"type": "tabphase", "values": ", ".join(map(str, TABULATED))},
     "blendphase": lambda: {
         "type": "blendphase",
         "weight": 0.3,
@@ -425,9 +425,7 @@ def room():
 def without_emitter_sampling():
     """Fog that casts no shadow rays: large lamps and the sky, found by the phase function."""
     sky = {"type": "constant", "radiance": rgb([0.3, 0.4, 0.5])}
-    scene = fog(
-        homogeneous(0.5, 0.9, hg(0.3), sample_emitters=False), lights=points(30, total=3.0)
-    )
+    scene = fog(homogeneous(0.5, 0.9, hg(0.3), sample_emitters=False), lights=points(30, total=3.0))
     return {**scene, **round_lamps(20, total=40.0, size=0.4), "sky": sky}
 
 

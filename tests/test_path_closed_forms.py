@@ -12,8 +12,8 @@ import pytest
 
 from tests import closed_form, path_scenes
 from tests import statistics_tools as tools
-from tests.path_references import light_tree
-from tests.path_scenes import hg, homogeneous, rgb
+from tests.path_references import METHODS, PARAMETERS, light_tree, parameter_id, quick_and_slow
+from tests.path_scenes import homogeneous, rgb
 from tests.references import ERROR, planned_images
 
 pytestmark = pytest.mark.usefixtures("plugin")
@@ -45,7 +45,7 @@ def assert_exact(images, exact, tile=8, label=""):
 
 
 @both_variants
-@pytest.mark.parametrize("depth", [1, 2, 3, 8, -1])
+@pytest.mark.parametrize("depth", quick_and_slow([1, 2, 3, 8, -1], [1, 2, -1]))
 def test_furnace(variant, depth):
     """Each bounce adds one term of the geometric sum."""
     images = images_of(path_scenes.furnace(), max_depth=depth)
@@ -59,30 +59,51 @@ def test_furnace_with_lossless_things(variant):
     assert_exact(images, path_scenes.furnace_radiance(-1))
 
 
-@pytest.mark.parametrize("rr_depth", [1, 2, 1000])
+@pytest.mark.parametrize("rr_depth", quick_and_slow([1, 2, 1000], [1]))
 def test_furnace_with_russian_roulette(llvm, rr_depth):
     """Early, late and no termination."""
     images = images_of(path_scenes.furnace(), rr_depth=rr_depth)
     assert_exact(images, path_scenes.furnace_radiance(-1))
 
 
-@both_variants
-@pytest.mark.parametrize("medium", path_scenes.WHITE_MEDIA)
-def test_furnace_filled_with_white_medium(variant, medium):
+def filled_furnace(medium):
     """Scattering without absorption changes nothing; lights on all sides, the camera in fog."""
     images = images_of(path_scenes.furnace(path_scenes.WHITE_MEDIA[medium]()))
-    assert_exact(images, path_scenes.furnace_radiance(-1))
+    assert_exact(images, path_scenes.furnace_radiance(-1), label=medium)
 
 
-@both_variants
-@pytest.mark.parametrize("medium", path_scenes.WHITE_MEDIA)
-def test_white_medium_under_uniform_sky(variant, medium):
+@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["chromatic"]))
+def test_furnace_filled_with_white_medium(llvm, medium):
+    """All media and phase functions in llvm_ad_rgb."""
+    filled_furnace(medium)
+
+
+@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["isotropic", "smoke"]))
+def test_furnace_filled_with_white_medium_in_scalar_variant(scalar, medium):
+    """The same in scalar_rgb."""
+    filled_furnace(medium)
+
+
+def white_ball(medium):
     """The ball of fog cannot be seen, nor what is in it."""
     fog = path_scenes.WHITE_MEDIA[medium]()
     images = images_of(path_scenes.open_air(fog, path_scenes.lossless_things()))
-    assert_exact(images, path_scenes.SKY)
+    assert_exact(images, path_scenes.SKY, label=medium)
 
 
+@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["hg-forward", "smoke"]))
+def test_white_medium_under_uniform_sky(llvm, medium):
+    """All media and phase functions in llvm_ad_rgb."""
+    white_ball(medium)
+
+
+@pytest.mark.parametrize("medium", path_scenes.WHITE_MEDIA)
+def test_white_medium_under_uniform_sky_in_scalar_variant(scalar, medium):
+    """The same in scalar_rgb."""
+    white_ball(medium)
+
+
+@pytest.mark.slow
 def test_furnace_notices_absorption(llvm):
     """Fog that absorbs 1 % of what it scatters is found."""
     grey = homogeneous(1.0, 0.99)
@@ -161,12 +182,25 @@ def test_plane_in_absorbing_fog(variant):
 
 # ---------------------------------------------------------------------------------- one scattering
 
+FLAKES = (0.15, 0.35, 0.9, 0.05, 0.1, -0.1)
 PHASES = {
-    "isotropic": (lambda: {"type": "isotropic"}, closed_form.isotropic),
-    "hg-forward": (lambda: hg(0.7), closed_form.henyey_greenstein(0.7)),
-    "hg-backward": (lambda: hg(-0.5), closed_form.henyey_greenstein(-0.5)),
-    "rayleigh": (lambda: {"type": "rayleigh"}, closed_form.rayleigh),
+    "isotropic": closed_form.Phase(closed_form.isotropic),
+    "hg-forward": closed_form.Phase(closed_form.henyey_greenstein(0.7)),
+    "hg-backward": closed_form.Phase(closed_form.henyey_greenstein(-0.5)),
+    "rayleigh": closed_form.Phase(closed_form.rayleigh),
+    "tabphase": closed_form.Phase(closed_form.tabulated(path_scenes.TABULATED)),
+    "blendphase": closed_form.Phase(
+        closed_form.blend(0.3, closed_form.henyey_greenstein(0.6), closed_form.rayleigh)
+    ),
+    "flakes": closed_form.Flakes(*FLAKES),
 }
+
+
+def phase_dict(name):
+    """A phase function as a dictionary."""
+    if name == "flakes":
+        return {"type": "sggx", "S": path_scenes.microflakes(*FLAKES)}
+    return path_scenes.PHASES[name]()
 
 
 def lights_around(count=40):
@@ -194,14 +228,54 @@ def fog_alone(camera, lights, **medium):
     return scene
 
 
-@both_variants
-@pytest.mark.parametrize("name", PHASES)
-def test_single_scattering(variant, name):
+def single_scattering(name, **parameters):
     """Points and spots in fog of three extinctions and albedos, pixel by pixel."""
-    make, phase = PHASES[name]
     camera = closed_form.Camera((0, -3, 0), (0, 0, 0), (0, 0, 1), 30, 6, 4)
     lights = lights_around()
-    exact = closed_form.single_scatter_image(camera, lights, EXTINCTION, ALBEDO, phase)
-    scene = fog_alone(camera, lights, sigma_t=EXTINCTION, albedo=ALBEDO, phase=make())
-    images = images_of(scene, max_depth=2)
-    assert_exact(images, exact, tile=1, label=f"single scattering, {name}, {variant}")
+    exact = closed_form.single_scatter_image(camera, lights, EXTINCTION, ALBEDO, PHASES[name])
+    scene = fog_alone(camera, lights, sigma_t=EXTINCTION, albedo=ALBEDO, phase=phase_dict(name))
+    images = images_of(scene, max_depth=2, **parameters)
+    assert_exact(images, exact, tile=1, label=f"{name}, {parameters}")
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_single_scattering(llvm, name):
+    """All phase functions in llvm_ad_rgb."""
+    single_scattering(name)
+
+
+@pytest.mark.parametrize("name", quick_and_slow(PHASES, ["hg-backward"]))
+def test_single_scattering_in_scalar_variant(scalar, name):
+    """The same in scalar_rgb."""
+    single_scattering(name)
+
+
+@pytest.mark.parametrize("parameters", PARAMETERS, ids=parameter_id)
+def test_single_scattering_does_not_depend_on_parameters(llvm, parameters):
+    """Every setting trades noise for time and leaves the mean alone."""
+    single_scattering("hg-forward", **parameters)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=parameter_id)
+def test_single_scattering_of_method(llvm, method):
+    """The methods have one mean."""
+    single_scattering("hg-backward", **method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS[1:], ids=parameter_id)
+@pytest.mark.parametrize("parameters", PARAMETERS, ids=parameter_id)
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_single_scattering_of_talk_does_not_depend_on_parameters(variant, parameters, method):
+    """Every setting of the method of the talk."""
+    single_scattering("rayleigh", **method, **parameters)
+
+
+@pytest.mark.parametrize("method", METHODS[:2], ids=parameter_id)
+@pytest.mark.parametrize(
+    "parameters", quick_and_slow(PARAMETERS, PARAMETERS[-2:]), ids=parameter_id
+)
+def test_furnace_does_not_depend_on_parameters(llvm, parameters, method):
+    """Every setting with many bounces between emitters on all sides."""
+    images = images_of(path_scenes.furnace(), **parameters, **method)
+    assert_exact(images, path_scenes.furnace_radiance(-1), label=f"{parameters}, {method}")
