@@ -30,7 +30,6 @@ from tests.light_scenes import (
     stripes,
     transform,
     triangles,
-    visible_lights,
     with_material,
     with_mirror,
 )
@@ -136,13 +135,29 @@ def mirrors():
     }
 
 
+def lamps_in_view(count=20, total=20.0):
+    """Spheres behind the ball and the block, and above them."""
+    lights = {}
+    for index, colour in enumerate(colours(count, np.random.default_rng(44), total)):
+        x, y, z = -2.2 + 1.1 * (index % 5), 1.9 + 0.3 * (index % 3), 0.2 + 0.25 * (index // 5)
+        lights[f"lamp_{index}"] = {
+            "type": "sphere",
+            "center": [x, y, z],
+            "radius": 0.15,
+            "emitter": area(rgb(colour)),
+        }
+    return lights
+
+
 def visible_through():
     """Lamps in view, some of them behind glass, a mask and an opening."""
     return {
-        **visible_lights(),
-        "window": pane({"type": "thindielectric"}, (0.3, 0.2, 0.5), (0.3, 0.4)),
-        "net": pane(MIRRORS["mask"](), (1.3, 0.2, 0.5), (0.4, 0.4), -90),
-        "hole": pane({"type": "null"}, (-1.2, 0.2, 0.5), (0.2, 0.3)),
+        **stage(),
+        **points(40, total=8.0),
+        **lamps_in_view(),
+        "window": pane({"type": "thindielectric"}, (0.2, 1.4, 0.5), (0.4, 0.4)),
+        "net": pane(MIRRORS["mask"](), (1.3, 1.4, 0.9), (0.4, 0.3), -90),
+        "hole": pane({"type": "null"}, (-1.1, 1.4, 0.8), (0.4, 0.4)),
         "glass": ball({"type": "dielectric"}, (0.6, -1.1, 0.3), 0.3),
     }
 
@@ -453,17 +468,8 @@ def fog_many_kinds():
 
 def fog_visible_lamps():
     """Lamps in view behind and above fog, for the emitters that the camera sees."""
-    lights = {}
-    for index, colour in enumerate(colours(20, np.random.default_rng(44), 20.0)):
-        x, y, z = -2.2 + 1.1 * (index % 5), 1.9 + 0.3 * (index % 3), 0.2 + 0.25 * (index // 5)
-        lights[f"lamp_{index}"] = {
-            "type": "sphere",
-            "center": [x, y, z],
-            "radius": 0.15,
-            "emitter": area(rgb(colour)),
-        }
-    scene = {**stage(), **points(40, total=8.0), **lights}
-    scene["fog"] = box((-2.4, -2.4, -0.1), (2.4, 1.3, TOP), interior=homogeneous(0.3))
+    scene = {**stage(), **points(40, total=8.0), **lamps_in_view()}
+    scene["fog"] = box((-2.4, -2.4, -0.1), (2.4, 1.3, 0.8), interior=homogeneous(0.3))
     return scene
 
 
@@ -560,7 +566,7 @@ FOGS = {
     "lamps-inside": lambda: fog(homogeneous(0.3), TALL, round_lamps()),
     "points-inside": lambda: fog(homogeneous(0.2), TALL, points(60, total=12.0)),
     "points-in-bubble": points_in_bubble,
-    "points-unbounded": lambda: unbounded(points(60, total=12.0)),
+    "points-unbounded": lambda: unbounded(points(60, total=12.0), sigma_t=(0.06, 0.08, 0.12)),
     "lamps-unbounded": lambda: unbounded(round_lamps()),
     "nested": nested_media,
     "overlapping": overlapping_media,

@@ -19,6 +19,9 @@ from tests.references import ERROR, planned_images
 pytestmark = pytest.mark.usefixtures("plugin")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+llvm_first = pytest.mark.parametrize(
+    "variant", quick_and_slow(["scalar_rgb", "llvm_ad_rgb"], ["llvm_ad_rgb"]), indirect=True
+)
 
 HEIGHT, WIDTH = path_scenes.stage()["sensor"]["film"]["height"], 24
 CAMERA = closed_form.Camera((0, -2, 3), (0, 0, 0), (0, 0, 1), 40, 6, 4)
@@ -72,13 +75,14 @@ def filled_furnace(medium):
     assert_exact(images, path_scenes.furnace_radiance(-1), label=medium)
 
 
-@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["chromatic"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("medium", path_scenes.WHITE_MEDIA)
 def test_furnace_filled_with_white_medium(llvm, medium):
     """All media and phase functions in llvm_ad_rgb."""
     filled_furnace(medium)
 
 
-@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["isotropic", "smoke"]))
+@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["chromatic", "smoke"]))
 def test_furnace_filled_with_white_medium_in_scalar_variant(scalar, medium):
     """The same in scalar_rgb."""
     filled_furnace(medium)
@@ -91,7 +95,7 @@ def white_ball(medium):
     assert_exact(images, path_scenes.SKY, label=medium)
 
 
-@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["hg-forward", "smoke"]))
+@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["chromatic", "smoke"]))
 def test_white_medium_under_uniform_sky(llvm, medium):
     """All media and phase functions in llvm_ad_rgb."""
     white_ball(medium)
@@ -169,7 +173,7 @@ def lights_above(count=40):
     return lights
 
 
-@both_variants
+@llvm_first
 def test_plane_in_absorbing_fog(variant):
     """Points and spots above a plane: both ways of the light lead through fog, pixel by pixel."""
     lights = lights_above()
@@ -271,10 +275,9 @@ def test_single_scattering_of_talk_does_not_depend_on_parameters(variant, parame
     single_scattering("rayleigh", **method, **parameters)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS[:2], ids=parameter_id)
-@pytest.mark.parametrize(
-    "parameters", quick_and_slow(PARAMETERS, PARAMETERS[-2:]), ids=parameter_id
-)
+@pytest.mark.parametrize("parameters", PARAMETERS, ids=parameter_id)
 def test_furnace_does_not_depend_on_parameters(llvm, parameters, method):
     """Every setting with many bounces between emitters on all sides."""
     images = images_of(path_scenes.furnace(), **parameters, **method)

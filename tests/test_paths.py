@@ -30,6 +30,9 @@ from tests.test_determinism import digest
 pytestmark = pytest.mark.usefixtures("plugin")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+llvm_first = pytest.mark.parametrize(
+    "variant", quick_and_slow(["scalar_rgb", "llvm_ad_rgb"], ["llvm_ad_rgb"]), indirect=True
+)
 
 # One scene for each feature; the others differ in details.
 QUICK = (
@@ -44,7 +47,7 @@ QUICK = (
     "environment",
 )
 QUICK_SCALAR = ("mirrors", "nested")
-QUICK_SPECTRAL = ("fog-chromatic",)
+QUICK_SPECTRAL = ("mirrors", "points-unbounded")
 POLARIZED = ("gallery", "gallery-environment", "mirrors", "fog", "smoke", "nested", "fog-in-glass")
 
 # In `path`, what lets light through counts as a bounce and blocks shadow rays; not in `volpath`.
@@ -58,6 +61,11 @@ TRANSPARENT = (
     "material-null",
     "material-thindielectric",
 )
+
+OPAQUE = [name for name in path_scenes.SURFACES if name not in TRANSPARENT]
+
+VISIBLE = quick_and_slow(["visible-through", "visible-lamps"], ["visible-through"])
+"""Scenes whose emitters the camera sees."""
 
 ALL_DEPTHS = -1
 DEPTHS = (2, 9, ALL_DEPTHS)
@@ -81,7 +89,7 @@ def assert_unbiased(name, variant, sensor=0, **parameters):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [n for n in path_scenes.SURFACES if n not in TRANSPARENT])
+@pytest.mark.parametrize("name", OPAQUE)
 def test_path_agrees_with_volpath(llvm, name):
     """Without media and what lets light through, the references are two estimates of one mean."""
     assert_reference_agrees(name, "volpath")
@@ -157,8 +165,8 @@ def test_mean_at_depth_in_scalar_variant(scalar, name, depth):
     assert_unbiased(name, scalar, max_depth=depth)
 
 
-@both_variants
-@pytest.mark.parametrize("name", ["visible-through", "visible-lamps"])
+@llvm_first
+@pytest.mark.parametrize("name", VISIBLE)
 def test_mean_of_visible_emitters(variant, name):
     """With `max_depth` 1 only what the camera sees directly."""
     assert_unbiased(name, variant, max_depth=1)
@@ -172,10 +180,8 @@ def test_no_light_without_segments(variant, name):
     assert (tools.render_seeds(scene, integrator, 4, range(2)) == 0).all()
 
 
-@both_variants
-@pytest.mark.parametrize(
-    "name", quick_and_slow(["visible-through", "visible-lamps"], "visible-through")
-)
+@llvm_first
+@pytest.mark.parametrize("name", VISIBLE)
 def test_mean_with_hidden_emitters(variant, name):
     """Hidden emitters disappear for the camera and still give light."""
     assert_unbiased(name, variant, hide_emitters=True)
@@ -228,7 +234,8 @@ def test_mean_with_stratified_sampler(variant, name):
     tools.assert_same_mean(images, reference, label=f"{name}, {variant}")
 
 
-@pytest.mark.parametrize("sensor", quick_and_slow([0, 1], [1]))
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", [0, 1])
 def test_mean_of_two_cameras(llvm, sensor):
     """One camera in fog and one outside of it."""
     assert_unbiased("two-cameras", llvm, sensor)
@@ -248,9 +255,7 @@ def test_cameras_in_turn(variant):
 
 
 @both_variants
-@pytest.mark.parametrize(
-    "name", quick_and_slow(["visible-through", "camera-inside"], "visible-through")
-)
+@pytest.mark.parametrize("name", quick_and_slow(["mirrors", "camera-inside"], ["mirrors"]))
 def test_mean_under_nesting(variant, name):
     """As part of `aov`, which adds the distance; the colours and the distance agree."""
     scene = path_scenes.load(name)
@@ -261,7 +266,7 @@ def test_mean_under_nesting(variant, name):
             (known(name, max_depth=MAX_DEPTH), 100_000),
         )
     )
-    assert images.shape[-1] > 4
+    assert images.shape[-1] == 4
     tools.assert_same_mean(images, reference, label=f"{name}, {variant}, aov")
 
 
@@ -277,32 +282,47 @@ def alpha_images(name, integrator, first_seed, description=None):
     """The alpha channel alone, which needs few samples."""
     scene = description or path_scenes.SCENES[name]()
     scene["sensor"]["film"]["pixel_format"] = "rgba"
-    seeds = range(first_seed, first_seed + 32)
-    return tools.render_seeds(mi.load_dict(scene), integrator, 65, seeds)[..., 3:]
+    seeds = range(first_seed, first_seed + 16)
+    return tools.render_seeds(mi.load_dict(scene), integrator, 129, seeds)[..., 3:]
 
 
-@both_variants
-@pytest.mark.parametrize("depth", [1, MAX_DEPTH])
-@pytest.mark.parametrize("hide_emitters", [False, True], ids=["shown", "hidden"])
-@pytest.mark.parametrize("name", ["silhouettes", "fog-silhouettes"])
-def test_alpha(variant, name, hide_emitters, depth):
-    """The share of valid rays is that of Mitsuba's integrator in the same variant."""
-    parameters = {"max_depth": depth, "hide_emitters": hide_emitters}
+def assert_same_alpha(name, **parameters):
+    """Compare the share of valid rays with that of Mitsuba's integrator in the same variant."""
     images = alpha_images(name, light_tree(**parameters), 0)
     reference = alpha_images(name, known(name, **parameters), 100_000)
-    tools.assert_same_mean(images, reference, label=f"{name}, {variant}")
+    tools.assert_same_mean(images, reference, label=f"{name}, {parameters}")
+    return reference.mean(axis=0)
+
+
+hidden = pytest.mark.parametrize("hide_emitters", [False, True], ids=["shown", "hidden"])
 
 
 @both_variants
-@pytest.mark.parametrize("hide_emitters", [False, True], ids=["shown", "hidden"])
-@pytest.mark.parametrize("name", ["gallery-environment", "environment"])
+@hidden
+@pytest.mark.parametrize("name", ["silhouettes", "fog-silhouettes"])
+def test_alpha(variant, name, hide_emitters):
+    """Glass, masks, lamps and fog with nothing behind them."""
+    alpha = assert_same_alpha(name, max_depth=MAX_DEPTH, hide_emitters=hide_emitters)
+    assert alpha.min() == 0 < alpha.max()
+
+
+@both_variants
+@hidden
+@pytest.mark.parametrize("name", ["fog-silhouettes"])
+def test_alpha_of_visible_emitters(variant, name, hide_emitters):
+    """With `max_depth` 1; without media it differs by variant in Mitsuba's `path`."""
+    assert_same_alpha(name, max_depth=1, hide_emitters=hide_emitters)
+
+
+@both_variants
+@hidden
+@pytest.mark.parametrize(
+    "name", quick_and_slow(["gallery-environment", "environment"], ["gallery-environment"])
+)
 def test_alpha_of_environment(variant, name, hide_emitters):
     """The sky is valid, unless emitters are hidden."""
-    parameters = {"max_depth": MAX_DEPTH, "hide_emitters": hide_emitters}
-    images = alpha_images(name, light_tree(**parameters), 0)
-    reference = alpha_images(name, known(name, **parameters), 100_000)
-    tools.assert_same_mean(images, reference, label=f"{name}, {variant}")
-    assert (reference.mean(axis=0) == 1).all() != hide_emitters
+    alpha = assert_same_alpha(name, max_depth=MAX_DEPTH, hide_emitters=hide_emitters)
+    assert (alpha == 1).all() != hide_emitters
 
 
 # ------------------------------------------------------------------------------------- determinism
@@ -311,23 +331,25 @@ def test_alpha_of_environment(variant, name, hide_emitters):
 SAMPLES = 16
 
 
-def larger_image(name, seed=7):
-    """An image with enough pixels for both threads to get work, from a freshly loaded scene."""
-    scene = path_scenes.load(name, width=96, height=64)
-    integrator = light_tree(max_depth=MAX_DEPTH)
-    return np.array(mi.render(scene, integrator=integrator, spp=SAMPLES, seed=seed))
-
-
 @both_variants
 @pytest.mark.parametrize("name", ["gallery", "fog-chromatic", "smoke"])
 def test_image_does_not_depend_on_threads(variant, name, thread_count):
-    """One thread, two threads, and two again give the same bits; another seed does not."""
+    """One thread, two threads, and two again give the same bits; another seed does not.
+
+    All of one loaded scene: Mitsuba's order of several rectangles differs when it is loaded again.
+    """
+    scene = path_scenes.load(name, width=96, height=64)
+
+    def rendered(seed=7):
+        integrator = light_tree(max_depth=MAX_DEPTH)
+        return digest(np.array(mi.render(scene, integrator=integrator, spp=SAMPLES, seed=seed)))
+
     thread_count(1)
-    one = digest(larger_image(name))
+    one = rendered()
     thread_count(2)
-    assert digest(larger_image(name)) == one
-    assert digest(larger_image(name)) == one
-    assert digest(larger_image(name, seed=8)) != one
+    assert rendered() == one
+    assert rendered() == one
+    assert rendered(seed=8) != one
 
 
 # ----------------------------------------------------------------------------------- planted biases
@@ -367,7 +389,7 @@ PLANTED = {
     "phase-hg-backward": ("phase-hg-backward", ("g",), 0.85),
     "phase-blendphase": ("phase-blendphase", ("weight",), 1.3),
 }
-QUICK_PLANTED = ("light-surfaces", "light-mirrors", "light-fog", "extinction-fog")
+QUICK_PLANTED = ("light-surfaces", "extinction-fog")
 
 
 def planted_images(name, description):
@@ -435,9 +457,9 @@ def is_light(part):
 
 
 def test_planted_bias_of_alpha_is_found(llvm):
-    """Fog that is 10 % thicker changes the share of valid rays."""
+    """Fog that is 30 % thicker changes the share of valid rays."""
     name, integrator = "fog-silhouettes", {"max_depth": MAX_DEPTH}
-    thicker = scaled(path_scenes.SCENES[name](), 1.1, ("sigma_t",))
+    thicker = scaled(path_scenes.SCENES[name](), 1.3, ("sigma_t",))
     images = alpha_images(name, light_tree(**integrator), 0, thicker)
     reference = alpha_images(name, known(name, **integrator), 100_000)
     with pytest.raises(AssertionError, match="significance"):
