@@ -1,7 +1,7 @@
-"""Exact pixel values of a diffuse plane under point and spot lights, by quadrature in numpy.
+"""Exact pixel values of a diffuse plane and of fog under point and spot lights, by quadrature.
 
-Nothing here calls Mitsuba: the camera, the lights' emission and the reflection are written down
-again, so that a mistake in reading the scene shows as well as one in the sampling.
+Nothing here calls Mitsuba, only numpy: the camera, the lights' emission, reflection and scattering
+are written down again, so that a mistake in reading the scene shows as well as one in the sampling.
 """
 
 from __future__ import annotations
@@ -69,8 +69,11 @@ def plane_points(camera, x, y):
     return np.array(camera.origin) + distances[..., np.newaxis] * directions
 
 
-def reflected_radiance(points, lights, albedo):
-    """Radiance that the diffuse plane z = 0 reflects at `points`: exact sum over the lights."""
+def reflected_radiance(points, lights, albedo, extinction=0.0):
+    """Radiance that the diffuse plane z = 0 reflects at `points`: exact sum over the lights.
+
+    With `extinction`, a number or one for each channel, the light crosses an absorbing medium.
+    """
     total = np.zeros((*points.shape[:-1], 3))
     for light in lights:
         offset = np.array(light.position) - points
@@ -78,12 +81,18 @@ def reflected_radiance(points, lights, albedo):
         towards = normalized(offset)
         cosine = np.maximum(towards[..., 2], 0)
         irradiance = light.falloff(-towards) * cosine / distance2
-        total += irradiance[..., np.newaxis] * np.array(light.intensity)
+        irradiance = irradiance[..., np.newaxis] * transmittance(np.sqrt(distance2), extinction)
+        total += irradiance * np.array(light.intensity)
     return np.array(albedo) / np.pi * total
 
 
-def plane_image(camera, lights, albedo, order=32):
-    """Expected image: the radiance averaged over each pixel with a midpoint rule of order^2.
+def transmittance(distances, extinction):
+    """Share of the light that is left, with a last axis for the channels."""
+    return np.exp(-np.asarray(distances)[..., np.newaxis] * np.broadcast_to(extinction, 3))
+
+
+def film_grid(camera, order):
+    """Film positions at the nodes of a midpoint rule of order^2 in each pixel.
 
     The midpoint rule and not Gauss's: the borders of spot lights are kinks.
     """
@@ -91,8 +100,125 @@ def plane_image(camera, lights, albedo, order=32):
     x = np.arange(camera.width)[:, np.newaxis] + nodes
     y = np.arange(camera.height)[:, np.newaxis] + nodes
     grid_y, grid_x = np.meshgrid(y.ravel(), x.ravel(), indexing="ij")
-    radiance = reflected_radiance(plane_points(camera, grid_x, grid_y), lights, albedo)
+    return grid_x, grid_y
+
+
+def pixel_means(camera, radiance, order):
+    """Average of the radiance at the nodes of `film_grid` over each pixel."""
     return radiance.reshape(camera.height, order, camera.width, order, 3).mean(axis=(1, 3))
+
+
+def plane_image(camera, lights, albedo, order=32, extinction=0.0):
+    """Expected image of the plane: the radiance averaged over each pixel."""
+    points = plane_points(camera, *film_grid(camera, order))
+    radiance = reflected_radiance(points, lights, albedo, extinction)
+    distances = np.linalg.norm(points - np.array(camera.origin), axis=-1)
+    return pixel_means(camera, radiance * transmittance(distances, extinction), order)
+
+
+def slab_image(camera, thickness, extinction, radiance, order=16):
+    """Expected image of a constant sky, seen through fog with faces across the line of sight."""
+    directions = camera.directions(*film_grid(camera, order))
+    axis = normalized(np.subtract(camera.target, camera.origin).astype(float))
+    seen = transmittance(thickness / (directions @ axis), extinction)
+    return pixel_means(camera, seen * np.array(radiance), order)
+
+
+def isotropic(cosine):
+    """Phase function that scatters alike in all directions."""
+    return np.full_like(cosine, 1 / (4 * np.pi))
+
+
+def henyey_greenstein(g):
+    """Phase function of the cosine of the deflection: 1 is straight on."""
+    return lambda cosine: (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
+
+
+def rayleigh(cosine):
+    """Phase function of small particles."""
+    return 3 / (16 * np.pi) * (1 + cosine**2)
+
+
+def tabulated(values):
+    """Phase function that is linear between values at equidistant cosines from -1 to 1."""
+    cosines = np.linspace(-1, 1, len(values))
+    integral = 2 * np.pi * np.trapezoid(values, cosines)
+    return lambda cosine: np.interp(cosine, cosines, values) / integral
+
+
+def blend(weight, first, second):
+    """Mixture of two phase functions; `weight` is that of the second one."""
+    return lambda cosine: (1 - weight) * first(cosine) + weight * second(cosine)
+
+
+class Phase:
+    """Scattering that depends on the deflection only."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def value(self, along, leaving):
+        """Density of scattering from one direction of travel into another one."""
+        return self.function((along * leaving).sum(axis=-1))
+
+    def area(self, direction):
+        """Factor of the extinction for light that travels along a direction."""
+        return np.ones(direction.shape[:-1])
+
+
+class Flakes:
+    """Mirrors whose normals are those of an ellipsoid: the SGGX model of Heitz et al. (2015)."""
+
+    def __init__(self, xx, yy, zz, xy, xz, yz):
+        self.matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
+
+    def area(self, direction):
+        """Area of the flakes, seen along a direction."""
+        return np.sqrt(np.einsum("...i,ij,...j", direction, self.matrix, direction))
+
+    def value(self, along, leaving):
+        """Density of scattering: that of the flakes half-way, seen along the light."""
+        half = normalized(leaving - along)
+        inverse = np.linalg.inv(self.matrix)
+        form = np.einsum("...i,ij,...j", half, inverse, half)
+        density = 1 / (np.pi * np.sqrt(np.linalg.det(self.matrix)) * form**2)
+        return density / (4 * self.area(along))
+
+
+def single_scatter_image(camera, lights, extinction, albedo, phase, order=4, nodes=64):
+    """Expected image of light that is scattered once, in fog without bounds or surfaces.
+
+    The lights have to be out of the camera's view: near them Gauss's rule would fail.
+    """
+    directions = camera.directions(*film_grid(camera, order))
+    dense = np.array(extinction) * phase.area(directions)[..., np.newaxis]
+    share, weights = np.polynomial.legendre.leggauss(nodes)
+    # Denser near the camera; cut off at e^-20
+    farthest = 20 / float(np.min(dense))
+    distances = farthest * ((share + 1) / 2) ** 2
+    weights = weights * farthest * (share + 1) / 2
+    total = np.zeros((*directions.shape[:-1], 3))
+    for distance, weight in zip(distances, weights):
+        points = np.array(camera.origin) + distance * directions
+        scattered = weight * np.exp(-distance * dense) * dense * np.array(albedo)
+        total += scattered * in_scattered(points, directions, lights, extinction, phase)
+    return pixel_means(camera, total, order)
+
+
+def in_scattered(points, directions, lights, extinction, phase):
+    """Radiance of the lights at `points` times the phase function towards the camera.
+
+    The phase function is that of the reversed path, as a path from the camera samples it.
+    """
+    total = np.zeros((*points.shape[:-1], 3))
+    for light in lights:
+        offset = np.array(light.position) - points
+        distance = np.linalg.norm(offset, axis=-1)
+        towards = normalized(offset)
+        arriving = light.falloff(-towards) * phase.value(directions, towards) / distance**2
+        length = distance * phase.area(towards)
+        total += arriving[..., np.newaxis] * transmittance(length, extinction) * light.intensity
+    return total
 
 
 def scene_dict(camera, lights, albedo):

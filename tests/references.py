@@ -45,7 +45,7 @@ def reference_variant(variant):
     return twin if has_llvm else variant
 
 
-def planned_images(scene, integrator, error, first_seed):
+def planned_images(scene, integrator, error, first_seed, sensor=0):
     """Render `SEEDS` images with as many samples as the relative `error` of their mean needs.
 
     Numbers of samples are odd: LLVM variants compile one kernel for powers of two and another one
@@ -53,10 +53,10 @@ def planned_images(scene, integrator, error, first_seed):
     """
     pilot_spp = 5
     pilot_seeds = range(first_seed, first_seed + 16)
-    pilot = tools.render_seeds(scene, integrator, pilot_spp, pilot_seeds)
+    pilot = tools.render_seeds(scene, integrator, pilot_spp, pilot_seeds, sensor)
     spp = tools.samples_for_precision(pilot, pilot_spp, SEEDS, error)
     seeds = range(first_seed + 1000, first_seed + 1000 + SEEDS)
-    return tools.render_seeds(scene, integrator, max(pilot_spp, spp | 1), seeds)
+    return tools.render_seeds(scene, integrator, max(pilot_spp, spp | 1), seeds, sensor)
 
 
 def set_power_weights(scene, samples=64):
