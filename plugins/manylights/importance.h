@@ -281,13 +281,16 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
                              LightKind kind) {
     using Vector3f  = mitsuba::Vector<Float, 3>;
     Vector3f origin = row.vector(0) - at.p;
+    // What one point of a segment does not see may shine on another one
+    float least = at.extent == Extent::Segment ? .05f : 0.f;
     switch (kind) {
         case LightKind::Point:
             return { origin, Float(0.f), Float(1.f) };
         case LightKind::Spot: {
             Float cos_theta =
                 -dr::dot(row.vector(3), origin) * dr::rsqrt(dr::squared_norm(origin));
-            return { origin, Float(0.f), spot_falloff(row, cos_theta) };
+            return { origin, Float(0.f),
+                     dr::maximum(spot_falloff(row, cos_theta), least) };
         }
         case LightKind::Triangle: {
             Vector3f e1 = row.vector(3), e2 = row.vector(6), a = .5f * dr::cross(e1, e2),
@@ -296,11 +299,13 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
                   back  = flat_intensity<Float>(-a, w);
             // Edge-on to a smooth triangle some normals may still face x: leave a floor
             Float both = dr::maximum(front + back, .05f * dr::norm(a));
+            front      = dr::maximum(front, least * dr::norm(a));
             return { w, .16f * dr::norm(a), dr::select(row.two_sided(), both, front) };
         }
         case LightKind::Disk: {
             Vector3f a = dr::Pi<Float> * dr::cross(row.vector(3), row.vector(6));
-            return { origin, .16f * dr::norm(a), flat_intensity<Float>(a, origin) };
+            return { origin, .16f * dr::norm(a),
+                     dr::maximum(flat_intensity<Float>(a, origin), least * dr::norm(a)) };
         }
         case LightKind::Sphere:
             return { origin, dr::square(row[3]), dr::Pi<Float> * dr::square(row[3]) };

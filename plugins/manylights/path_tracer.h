@@ -136,14 +136,17 @@ private:
         Mask ends_there = surface && !piece.scattered;
 
         BSDFPtr bsdf = bsdf_of(si, surface);
-        s.active &= piece.scattered ||
-                    (ends_there && (!is_last(s) || can_pass(bsdf, ends_there)));
+        Mask goes_on = ends_there && (!is_last(s) || can_pass(bsdf, ends_there));
+        if (m_media) // as in volpath; in path the last surface does not count
+            s.valid |= ends_there && !goes_on;
+        s.active &= piece.scattered || goes_on;
         if (dr::none_or<false>(s.active))
             return;
         surface &= s.active;
 
-        Vertex vertex = m_direct.prepare(si, bsdf, m_media ? &piece.inside : nullptr,
-                                         draw_sample(s), plain(s.depth == 0u), s.active);
+        Vertex vertex =
+            m_direct.prepare(si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
+                             plain(s.depth == 0u), surface || piece.inside.here);
         add_direct_light(s, vertex, piece, surface);
         scatter(s, vertex, piece);
         play_roulette(s);
