@@ -4,6 +4,128 @@
 
 NAMESPACE_BEGIN(mitsuba)
 
+/**!
+
+.. _integrator-manylights_volpath:
+
+Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
+---------------------------------------------------------------------
+
+.. pluginparameters::
+
+ * - max_depth
+   - |int|
+   - Longest path depth, where -1 stands for infinity. A value of 1 renders directly visible
+     lights only, 2 adds direct illumination and single scattering, and so on. (Default: -1)
+
+ * - rr_depth
+   - |int|
+   - Path depth from which on paths may be ended by Russian roulette. (Default: 5)
+
+ * - hide_emitters
+   - |bool|
+   - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+ * - splitting_rate
+   - |float|
+   - How many lights are considered at the first vertex of a path: about 8 times this number,
+     from 0 (a single random descent of the tree) to infinity (:code:`inf`: every light).
+     Later vertices consider 3/8 of them. (Default: 1)
+
+ * - reservoirs
+   - |int|
+   - Lights that are kept for a full evaluation of scattering and emission, 1 to 64.
+     (Default: 8)
+
+ * - shadow_rays
+   - |int|
+   - Lights that are tested for visibility at the first vertex, 1 to :code:`reservoirs`; a
+     quarter of it at later ones. (Default: 4)
+
+ * - method
+   - |string|
+   - Where the candidates come from, :code:`resampled_tree` or :code:`talk`, see
+     :monosp:`manylights_direct`. (Default: :code:`resampled_tree`)
+
+ * - split_function
+   - |string|
+   - Method :code:`talk` only: :code:`near` or :code:`far`. (Default: :code:`near`)
+
+ * - lights, lights_in_tree, nodes, depth
+   - |int|
+   - Size of the light tree that was built last.
+   - |exposed|, read-only
+
+ * - bytes, build_ms
+   - |float|
+   - Its memory in bytes, and the time to build it in milliseconds.
+   - |exposed|, read-only
+
+This integrator traces paths from the camera through scenes with very many lights, and samples
+the direct light of every vertex with the light tree of :ref:`manylights_direct
+<integrator-manylights_direct>`, on surfaces and in participating media alike.
+
+**Without media** it computes what :monosp:`path` computes: a surface that lets light pass
+straight on is a vertex like any other, and shadow rays end on it. **With media** it computes
+what :monosp:`volpath` computes: homogeneous and heterogeneous media with spectrally varying
+extinction, any phase function, nested and index-matched boundaries, cameras and lights inside
+of media. Surfaces without an effect (:monosp:`null`, :monosp:`thindielectric`,
+:monosp:`mask`) are then no vertices, and shadow rays pass them. Nothing of this is part of the
+kernel in scenes without media.
+
+**Single scattering.** In a homogeneous medium, the light that a piece of a path of length
+:math:`L` receives is not estimated at one random distance, but along all of it. The tree
+chooses lights for the whole segment: with :math:`D` the distance of a cluster from the line,
+:math:`\theta` the angle that the segment fills as seen from it, :math:`\Phi` its flux and
+:math:`e` its distance from the nearest point, which is at :math:`t`,
+
+.. math::
+
+    h = \Phi\, \frac{\theta}{D}\, e^{-\sigma (t + e)} \times \mathrm{emission}.
+
+Each candidate gets a distance of its own, half of the time with equal angles (Kulla and
+Fajardo 2012), half of the time in proportion to the transmittance. These pairs of light and
+distance are resampled with the full integrand like the lights of a surface. The surface behind
+is seen with the transmittance of the whole segment, so it has no noise of scattered and
+unscattered paths either. Against free-flight sampling alone this has 4 to 9 times less error at
+1.8 to 2 times the time (single scattering, 1,000 lights in an open field, a street and rooms
+full of fog); with a strongly forward-scattering phase function (hg, g = 0.8) both are level.
+
+Transmittance of shadow rays is exact in homogeneous media, and ratio-tracked in heterogeneous
+ones. Where the extinction varies between colour channels, distances have the mean of their
+densities: no weight exceeds the number of channels.
+
+**It works well** where direct light matters: many lights on surfaces and in fog, few bounces.
+**It works less well**
+
+- where the light that matters comes by many bounces: that noise is the same as that of
+  :monosp:`path`, and every vertex costs more;
+- for caustics of small lights, which paths from the camera hardly find;
+- in heterogeneous media with lights inside: their single scattering is estimated at the
+  distance of a random flight, and has fireflies around point lights;
+- in dense media, where lights are chosen as if the medium reached as far as the light;
+- where most lights are hidden, as in :monosp:`manylights_direct`.
+
+.. note:: Gradients of BSDFs, media and emitters flow through :code:`mi.render` in the
+   :code:`ad` variants; positions of lights are not differentiated. In JIT variants this
+   integrator refuses to be recorded by :code:`dr.freeze`. Media of shapes inside of a shape
+   group are noticed only if the scene has others, too.
+
+.. tabs::
+    .. code-tab::  xml
+        :name: manylights-volpath-integrator
+
+        <integrator type="manylights_volpath">
+            <integer name="max_depth" value="8"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'manylights_volpath',
+        'max_depth': 8
+
+ */
+
 template <typename Float, typename Spectrum>
 class ManyLightsVolpath final : public MonteCarloIntegrator<Float, Spectrum> {
 public:
