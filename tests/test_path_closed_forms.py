@@ -12,6 +12,7 @@ import pytest
 
 from tests import closed_form, path_scenes
 from tests import statistics_tools as tools
+from tests.light_scenes import HEIGHT, WIDTH
 from tests.path_references import METHODS, PARAMETERS, light_tree, parameter_id, quick_and_slow
 from tests.path_scenes import homogeneous, rgb
 from tests.references import ERROR, planned_images
@@ -23,7 +24,6 @@ llvm_first = pytest.mark.parametrize(
     "variant", quick_and_slow(["scalar_rgb", "llvm_ad_rgb"], ["llvm_ad_rgb"]), indirect=True
 )
 
-HEIGHT, WIDTH = path_scenes.stage()["sensor"]["film"]["height"], 24
 CAMERA = closed_form.Camera((0, -2, 3), (0, 0, 0), (0, 0, 1), 40, 6, 4)
 ALBEDO = (0.7, 0.5, 0.3)
 EXTINCTION = (0.1, 0.2, 0.3)
