@@ -431,8 +431,8 @@ def room():
     scene = {**stage(), **round_lamps(), "mist": homogeneous(0.2, 0.8)}
     scene["sensor"]["medium"] = reference("mist")
     scene["walls"] = box((-3, -5, -0.1), (3, 3, 3), wall, reference("mist"))
-    # The other side of these two is fog as well, as they say
-    for name in ("ball", "floor"):
+    # What is outside of these is fog as well, as they say
+    for name in ("ball", "floor", *round_lamps()):
         scene[name] |= media(None, reference("mist"))
     return scene
 

@@ -27,6 +27,7 @@ llvm_first = pytest.mark.parametrize(
 CAMERA = closed_form.Camera((0, -2, 3), (0, 0, 0), (0, 0, 1), 40, 6, 4)
 ALBEDO = (0.7, 0.5, 0.3)
 EXTINCTION = (0.1, 0.2, 0.3)
+FOG_CAMERA = closed_form.Camera((0, -3, 0), (0, 0, 0), (0, 0, 1), 30, 6, 4)
 
 
 def images_of(scene, **parameters):
@@ -234,10 +235,9 @@ def fog_alone(camera, lights, **medium):
 
 def single_scattering(name, **parameters):
     """Points and spots in fog of three extinctions and albedos, pixel by pixel."""
-    camera = closed_form.Camera((0, -3, 0), (0, 0, 0), (0, 0, 1), 30, 6, 4)
     lights = lights_around()
-    exact = closed_form.single_scatter_image(camera, lights, EXTINCTION, ALBEDO, PHASES[name])
-    scene = fog_alone(camera, lights, sigma_t=EXTINCTION, albedo=ALBEDO, phase=phase_dict(name))
+    exact = closed_form.single_scatter_image(FOG_CAMERA, lights, EXTINCTION, ALBEDO, PHASES[name])
+    scene = fog_alone(FOG_CAMERA, lights, sigma_t=EXTINCTION, albedo=ALBEDO, phase=phase_dict(name))
     images = images_of(scene, max_depth=2, **parameters)
     assert_exact(images, exact, tile=1, label=f"{name}, {parameters}")
 
