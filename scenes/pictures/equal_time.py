@@ -1,25 +1,26 @@
-"""Render the README's picture pair: Mitsuba's `direct` and `manylights_direct` at equal time.
+"""Render the README's picture pairs: Mitsuba's integrators and ours at equal time.
 
-    python scenes/pictures/equal_time.py
+    python scenes/pictures/equal_time.py [city] [fog]
 
 The city's windows are one textured mesh, so that Mitsuba chooses points on it in proportion to
 their radiance, which is the best of its own ways to sample this scene. Times are medians of
 three renders after a first one; both pictures come from the same process.
 """
 
+import sys
 import time
 from pathlib import Path
 
+import manylights
 import mitsuba as mi
 import numpy as np
-
-import manylights
 
 mi.set_variant("llvm_ad_rgb")
 FOLDER = Path(__file__).parent
 SIZE = {"width": 480, "height": 270}
 LIGHTS = 20_000
 SAMPLES = 16
+REFERENCES = 4
 
 
 def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
@@ -53,16 +54,29 @@ def write(image: np.ndarray, name: str) -> None:
     bitmap.write(str(FOLDER / name), quality=90)
 
 
-def main() -> None:
-    scene = mi.load_dict(manylights.scenes.city(LIGHTS, kind="mesh", texture=True, **SIZE))
-    ours = mi.load_dict({"type": "manylights_direct"})
-    theirs = mi.load_dict({"type": "direct"})
-    reference = np.mean([render(scene, ours, 128, 100 + i) for i in range(4)], axis=0)
+def city() -> tuple:
+    """The scene, both integrators, and the names of the pictures."""
+    scene = manylights.scenes.city(LIGHTS, kind="mesh", texture=True, **SIZE)
+    return scene, {"type": "direct"}, {"type": "manylights_direct"}, ("direct", "manylights")
+
+
+def fog() -> tuple:
+    """The same for the street in fog, with up to three scatterings."""
+    scene = manylights.scenes.fog_street(LIGHTS, kind="mesh", texture=True, **SIZE)
+    theirs, ours = ({"type": name, "max_depth": 4} for name in ("volpath", "manylights_volpath"))
+    return scene, theirs, ours, ("volpath", "manylights_fog")
+
+
+def render_pair(description: dict, theirs: dict, ours: dict, names: tuple) -> None:
+    """Render with ours, then with as many samples of theirs as take the same time."""
+    scene = mi.load_dict(description)
+    ours, theirs = mi.load_dict(ours), mi.load_dict(theirs)
+    reference = np.mean([render(scene, ours, 128, 100 + i) for i in range(REFERENCES)], axis=0)
 
     seconds = render_time(scene, ours, SAMPLES)
     # Mitsuba's time is proportional to the samples: find the number that takes as long
     spp = max(1, round(SAMPLES * seconds / render_time(scene, theirs, SAMPLES)))
-    for name, integrator, samples in (("direct", theirs, spp), ("manylights", ours, SAMPLES)):
+    for name, integrator, samples in zip(names, (theirs, ours), (spp, SAMPLES)):
         taken = render_time(scene, integrator, samples)
         image = render(scene, integrator, samples, 7)
         write(image, f"{name}.jpg")
@@ -70,6 +84,11 @@ def main() -> None:
             f"{name}: {samples} spp, {taken:.2f} s, "
             f"relative mean squared error {relative_error(image, reference):.4f}"
         )
+
+
+def main() -> None:
+    for name in sys.argv[1:] or ("city", "fog"):
+        render_pair(*{"city": city, "fog": fog}[name]())
 
 
 if __name__ == "__main__":
