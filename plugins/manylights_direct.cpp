@@ -1,5 +1,6 @@
 #include <manylights/direct_light.h>
 #include <manylights/export_plugin.h>
+#include <manylights/hidden_emitters.h>
 #include <manylights/light_cache.h>
 
 NAMESPACE_BEGIN(mitsuba)
@@ -151,12 +152,13 @@ public:
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         DirectLight direct(scene, m_cache.get(scene, sampler), m_params);
 
-        SurfaceInteraction3f si =
-            scene->ray_intersect(ray, +RayFlags::All, /* coherent = */ true, active);
-        Spectrum result(0.f);
+        auto pi = scene->ray_intersect_preliminary(ray, /* coherent = */ true, active);
         if (m_hide_emitters)
-            skip_emitters(scene, ray, si, active);
-        else
+            manylights::skip_emitters(scene, Ray3f(ray), pi, active);
+        SurfaceInteraction3f si =
+            pi.compute_surface_interaction(ray, +RayFlags::All, active);
+        Spectrum result(0.f);
+        if (!m_hide_emitters)
             result = direct.emission().emitted(si, active).first;
 
         active &= si.is_valid();
@@ -198,21 +200,6 @@ public:
     MI_DECLARE_CLASS(ManyLightsDirect)
 
 private:
-    /// Replace hits of area emitters by what lies behind them
-    void skip_emitters(const Scene *scene, const RayDifferential3f &ray,
-                       SurfaceInteraction3f &si, Mask active) const {
-        Mask skip = active && si.is_valid();
-        if constexpr (dr::is_jit_v<Float>)
-            skip &= si.shape->emitter() != nullptr;
-        else // a null shape has no virtual functions
-            skip = skip && si.shape->emitter() != nullptr;
-        if (!dr::any_or<true>(skip))
-            return;
-        PreliminaryIntersection3f pi =
-            Base::skip_area_emitters(scene, si.spawn_ray(ray.d), true, skip);
-        dr::masked(si, skip) = pi.compute_surface_interaction(ray, +RayFlags::All, skip);
-    }
-
     manylights::SamplingParameters m_params;
     Cache m_cache;
 };
