@@ -19,8 +19,7 @@ mi.set_variant("llvm_ad_rgb")
 FOLDER = Path(__file__).parent
 SIZE = {"width": 480, "height": 270}
 LIGHTS = 20_000
-SAMPLES = 16
-REFERENCES = 4
+REFERENCE_SAMPLES = 256
 
 
 def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
@@ -55,33 +54,34 @@ def write(image: np.ndarray, name: str) -> None:
 
 
 def city() -> tuple:
-    """The scene, both integrators, and the names of the pictures."""
+    """The scene, both integrators, the names of the pictures, and our samples per pixel."""
     scene = manylights.scenes.city(LIGHTS, kind="mesh", texture=True, **SIZE)
-    return scene, {"type": "direct"}, {"type": "manylights_direct"}, ("direct", "manylights")
+    return scene, {"type": "direct"}, {"type": "manylights_direct"}, ("direct", "manylights"), 16
 
 
 def fog() -> tuple:
     """The same for the street in fog, with up to three scatterings."""
     scene = manylights.scenes.fog_street(LIGHTS, kind="mesh", texture=True, **SIZE)
     theirs, ours = ({"type": name, "max_depth": 4} for name in ("volpath", "manylights_volpath"))
-    return scene, theirs, ours, ("volpath", "manylights_fog")
+    return scene, theirs, ours, ("volpath", "manylights_fog"), 8
 
 
-def render_pair(description: dict, theirs: dict, ours: dict, names: tuple) -> None:
+def render_pair(description: dict, theirs: dict, ours: dict, names: tuple, samples: int) -> None:
     """Render with ours, then with as many samples of theirs as take the same time."""
     scene = mi.load_dict(description)
     ours, theirs = mi.load_dict(ours), mi.load_dict(theirs)
-    reference = np.mean([render(scene, ours, 128, 100 + i) for i in range(REFERENCES)], axis=0)
+    parts = range(REFERENCE_SAMPLES // 64)
+    reference = np.mean([render(scene, ours, 64, 100 + part) for part in parts], axis=0)
 
-    seconds = render_time(scene, ours, SAMPLES)
+    seconds = render_time(scene, ours, samples)
     # Mitsuba's time is proportional to the samples: find the number that takes as long
-    spp = max(1, round(SAMPLES * seconds / render_time(scene, theirs, SAMPLES)))
-    for name, integrator, samples in zip(names, (theirs, ours), (spp, SAMPLES)):
-        taken = render_time(scene, integrator, samples)
-        image = render(scene, integrator, samples, 7)
+    spp = max(1, round(samples * seconds / render_time(scene, theirs, samples)))
+    for name, integrator, count in zip(names, (theirs, ours), (spp, samples)):
+        taken = render_time(scene, integrator, count)
+        image = render(scene, integrator, count, 7)
         write(image, f"{name}.jpg")
         print(
-            f"{name}: {samples} spp, {taken:.2f} s, "
+            f"{name}: {count} spp, {taken:.2f} s, "
             f"relative mean squared error {relative_error(image, reference):.4f}"
         )
 
