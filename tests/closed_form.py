@@ -185,10 +185,15 @@ class Flakes:
         return density / (4 * self.area(along))
 
 
+NEAR_CLIP = 0.01
+"""Mitsuba's default distance of the near plane."""
+
+
 def single_scatter_image(camera, lights, extinction, albedo, phase, order=4, nodes=64):
     """Expected image of light that is scattered once, in fog without bounds or surfaces.
 
-    The lights have to be out of the camera's view: near them Gauss's rule would fail.
+    The lights have to be out of the camera's view: near them Gauss's rule would fail. Rays of
+    Mitsuba's cameras start on their near plane, and so does the fog.
     """
     directions = camera.directions(*film_grid(camera, order))
     dense = np.array(extinction) * phase.area(directions)[..., np.newaxis]
@@ -197,9 +202,11 @@ def single_scatter_image(camera, lights, extinction, albedo, phase, order=4, nod
     farthest = 20 / float(np.min(dense))
     distances = farthest * ((share + 1) / 2) ** 2
     weights = weights * farthest * (share + 1) / 2
+    forward = normalized(np.subtract(camera.target, camera.origin))
+    start = NEAR_CLIP / (directions @ forward)[..., np.newaxis]
     total = np.zeros((*directions.shape[:-1], 3))
     for distance, weight in zip(distances, weights):
-        points = np.array(camera.origin) + distance * directions
+        points = np.array(camera.origin) + (start + distance) * directions
         scattered = weight * np.exp(-distance * dense) * dense * np.array(albedo)
         total += scattered * in_scattered(points, directions, lights, extinction, phase)
     return pixel_means(camera, total, order)

@@ -229,8 +229,7 @@ def fog_alone(camera, lights, **medium):
     """Lights in fog without bounds, and nothing else."""
     scene = closed_form.scene_dict(camera, lights, ALBEDO)
     del scene["plane"]
-    # A camera's rays start on its near plane: the fog before it would be missing
-    scene["sensor"].update(medium=homogeneous(**medium), near_clip=1e-4)
+    scene["sensor"]["medium"] = homogeneous(**medium)
     return scene
 
 
