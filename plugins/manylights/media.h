@@ -129,8 +129,11 @@ public:
             state, [](const State &s) { return s.active; },
             [&](State &s) {
                 SurfaceInteraction3f si = m_scene->ray_intersect(s.ray, s.active);
-                Float distance          = dr::minimum(si.t, s.ray.maxt);
-                Mask inside             = s.active && s.medium != nullptr;
+                // A shadow ray ends a little before the light, its medium does not
+                constexpr auto gap = mitsuba::math::ShadowEpsilon<Float>;
+                Float distance =
+                    dr::select(si.is_valid(), si.t, s.ray.maxt / (1.f - gap));
+                Mask inside = s.active && s.medium != nullptr;
                 if (dr::any_or<true>(inside))
                     dr::masked(s.result, inside) =
                         s.result *
