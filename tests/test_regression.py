@@ -29,7 +29,7 @@ SAMPLES = 16
 
 # The camera looks at hundreds of small, bright bulbs: their borders are most of the noise. In fog,
 # it is the lamps close by, and the glass, through which light is found by chance only.
-SAMPLES_OF = {"many_bulbs": 64, "fog": 32, "glass_fog": 64, "heterogeneous": 32}
+SAMPLES_OF = {"many_bulbs": 64, "fog": 32, "glass_fog": 64, "heterogeneous": 48}
 BIAS_OF = {"many_bulbs": 0.05, "no_lights": None}
 
 
