@@ -41,15 +41,25 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
 
  * - method
    - |string|
-   - Where the candidates come from. :code:`resampled_tree`: systematic sampling of a 4-wide
-     light tree. :code:`talk`: stochastic splitting of a binary tree as in the original
-     publication, for comparison. (Default: :code:`resampled_tree`)
+   - :code:`resampled_tree`: all that is described below. The others are for comparison.
+     :code:`talk`: stochastic splitting of a binary tree as in the original publication.
+     :code:`adaptive_splitting`: a node of the binary tree is split where the light of its
+     cluster varies by more than 1/8 :code:`splitting_rate` of all the light (Conty Estevez
+     and Kulla 2018), and every candidate gets a shadow ray. :code:`tree`: one random descent
+     and one shadow ray. :code:`exhaustive`: every light is a candidate.
+     (Default: :code:`resampled_tree`)
 
  * - split_function
    - |string|
    - Method :code:`talk` only: how the probability of splitting decays with the distance of
      a cluster, :code:`near` (quadratically) or :code:`far` (linearly). (Default:
      :code:`near`)
+
+ * - counts
+   - |bool|
+   - Adds the film channels :code:`candidates` and :code:`node_visits`: how many lights were
+     considered, and how many nodes of the tree visited, on average per camera ray.
+     (Default: no, i.e. |false|)
 
  * - lights, lights_in_tree, nodes, depth
    - |int|
@@ -138,7 +148,7 @@ public:
 
     ManyLightsDirect(const Properties &props)
         : Base(props), m_params(manylights::read_parameters(props)),
-          m_cache(m_params.method == manylights::Method::Talk) {}
+          m_cache(m_params.splits_nodes()) {}
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
                     bool evaluate) override {
@@ -148,7 +158,7 @@ public:
 
     std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
                                      const RayDifferential3f &ray, const Medium *,
-                                     Float *, Mask active) const override {
+                                     Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         DirectLight direct(scene, m_cache.get(scene, sampler), m_params);
 
@@ -163,6 +173,9 @@ public:
 
         active &= si.is_valid();
         Mask valid_ray = active;
+        manylights::Counts<Float> counts;
+        if (m_params.counts)
+            counts.write(aovs);
         if (dr::none_or<false>(active))
             return { result, valid_ray };
 
@@ -174,10 +187,16 @@ public:
         auto vertex  = direct.prepare(si, bsdf, nullptr, u, true, active);
         Mask smooth  = active && has_flag(bsdf->flags(), BSDFFlags::Smooth);
         if (dr::any_or<true>(smooth))
-            result += direct.sample_lights(vertex, smooth);
+            result += direct.sample_lights(vertex, counts, smooth);
+        if (m_params.counts)
+            counts.write(aovs);
         if (direct.needs_bsdf_samples())
             result += direct.sample_bsdf(vertex, sampler, active);
         return { result, valid_ray };
+    }
+
+    std::vector<std::string> aov_names() const override {
+        return manylights::count_channels(m_params);
     }
 
     void traverse(TraversalCallback *cb) override {

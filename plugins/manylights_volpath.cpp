@@ -44,12 +44,19 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
 
  * - method
    - |string|
-   - Where the candidates come from, :code:`resampled_tree` or :code:`talk`, see
-     :monosp:`manylights_direct`. (Default: :code:`resampled_tree`)
+   - :code:`resampled_tree`, or for comparison :code:`talk`, :code:`adaptive_splitting`,
+     :code:`tree` or :code:`exhaustive`, see :monosp:`manylights_direct`.
+     (Default: :code:`resampled_tree`)
 
  * - split_function
    - |string|
    - Method :code:`talk` only: :code:`near` or :code:`far`. (Default: :code:`near`)
+
+ * - counts
+   - |bool|
+   - Adds the film channels :code:`candidates` and :code:`node_visits`: how many lights were
+     considered, and how many nodes of the tree visited, on average per path.
+     (Default: no, i.e. |false|)
 
  * - lights, lights_in_tree, nodes, depth
    - |int|
@@ -136,7 +143,7 @@ public:
 
     ManyLightsVolpath(const Properties &props)
         : Base(props), m_params(manylights::read_path_parameters(props)),
-          m_cache(m_params.method == manylights::Method::Talk) {}
+          m_cache(m_params.splits_nodes()) {}
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
                     bool evaluate) override {
@@ -146,14 +153,22 @@ public:
 
     std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
                                      const RayDifferential3f &ray, const Medium *medium,
-                                     Float *, Mask active) const override {
+                                     Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         const auto &lights           = m_cache.get(scene, sampler);
         manylights::MediaKinds media = lights.media();
         media.add(medium);
         PathTracer tracer(scene, lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
-        return tracer.trace(sampler, Ray3f(ray), medium, active);
+        manylights::Counts<Float> counts;
+        auto result = tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+        if (m_params.counts)
+            counts.write(aovs);
+        return result;
+    }
+
+    std::vector<std::string> aov_names() const override {
+        return manylights::count_channels(m_params);
     }
 
     void traverse(TraversalCallback *cb) override {

@@ -38,6 +38,9 @@ METHODS = (
     {"method": "resampled_tree"},
     {"method": "talk"},
     {"method": "talk", "split_function": "far"},
+    {"method": "adaptive_splitting"},
+    {"method": "tree"},
+    {"method": "exhaustive"},
 )
 
 MAX_DEPTH = 4

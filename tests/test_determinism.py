@@ -14,7 +14,7 @@ from tests import light_scenes
 pytestmark = pytest.mark.usefixtures("plugin")
 
 VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
-METHODS = ["resampled_tree", "talk"]
+METHODS = ["resampled_tree", "talk", "adaptive_splitting"]
 
 # A power of two: the samples of a pixel then stay together when LLVM variants split the work, and
 # the order in which they are added does not depend on the number of threads.

@@ -201,7 +201,7 @@ def test_mean_with_early_russian_roulette(llvm, name, rr_depth):
 @pytest.mark.parametrize("method", METHODS, ids=parameter_id)
 @pytest.mark.parametrize("name", ["gallery", "fog", "smoke", "points-in-bubble"])
 def test_mean_of_method(llvm, name, method):
-    """The method of the talk has the same mean; see also `test_path_closed_forms`."""
+    """All methods have one mean; see also `test_path_closed_forms`."""
     assert_unbiased(name, llvm, **method)
 
 

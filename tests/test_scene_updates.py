@@ -409,6 +409,10 @@ def test_text_of_the_integrator(variant):
     assert "lights = 200, lights_in_tree = 200, nodes = " in str(integrator)
     assert_text(light_tree(splitting_rate=float("inf")), splitting_rate="inf")
     assert_text(light_tree(method="talk", split_function="far"), split_function="far")
+    assert_text(light_tree(method="adaptive_splitting", splitting_rate=2), splitting_rate=2)
+    assert_text(light_tree(method="exhaustive", reservoirs=3, shadow_rays=2), reservoirs=3)
+    for unused in ("splitting_rate", "reservoirs", "shadow_rays"):
+        assert unused not in str(light_tree(method="tree"))
 
 
 def assert_text(integrator, **values):
@@ -440,6 +444,12 @@ INVALID = [
     ({"method": 3}, ["method", "expected string", "integer"]),
     ({"split_function": "near"}, ["split_function", '"near"', "unless", "method"]),
     ({"method": "talk", "split_function": "middle"}, ["split_function", '"middle"', '"near" or']),
+    ({"method": "tree", "splitting_rate": 1}, ["splitting_rate", "left out", '"tree"']),
+    ({"method": "tree", "reservoirs": 8}, ["reservoirs", "left out", '"tree"']),
+    ({"method": "exhaustive", "splitting_rate": 1}, ["splitting_rate", "left out"]),
+    ({"method": "adaptive_splitting", "shadow_rays": 1}, ["shadow_rays", "left out"]),
+    ({"method": "adaptive_splitting", "split_function": "far"}, ["split_function", "unless"]),
+    ({"counts": 1}, ["counts", "expected boolean", "integer"]),
     ({"reservoir": 3}, ["unreferenced", '"reservoir": 3']),
 ]
 VALID = [
@@ -452,6 +462,10 @@ VALID = [
     {"bsdf_samples": 0},
     {"method": "talk"},
     {"method": "talk", "split_function": "near"},
+    {"method": "adaptive_splitting", "splitting_rate": 0.5},
+    {"method": "tree"},
+    {"method": "exhaustive", "reservoirs": 2, "shadow_rays": 1},
+    {"counts": True},
 ]
 
 

@@ -25,7 +25,8 @@ CERTAIN = 2.0**20
 """Number of points of systematic sampling that makes each light of moderate flux certain."""
 
 HUGE_RATE = 1e20
-SPLIT_FUNCTIONS = ("near", "far")
+STOCHASTIC = ("near", "far")
+SPLIT_FUNCTIONS = (*STOCHASTIC, "variance")
 
 
 # ------------------------------------------------------------------------------ lights, receivers
@@ -105,7 +106,7 @@ def draw_talk(tree, at, rate, trials, function, xi=None, seed=1):
     """The same for stochastic splitting, with the given `xi` or a random one for each sample."""
     numbers = uniform(trials, seed) if xi is None else np.full(trials, xi)
     return [
-        tree.talk_candidates(
+        tree.splitting_candidates(
             **at, rate=rate, xi=x, seed=seed * trials + index, split_function=function
         )
         for index, x in enumerate(numbers)
@@ -285,8 +286,8 @@ def test_any_tree_and_receiver_of_talk(shape, count, seed, place, normal, rate, 
     """Given xi the candidates' number is fixed: it is the sum of all probabilities."""
     tree = make_tree(*lights_of_shape(shape, count, seed, 2))
     at = receiver(place, normal)
-    exact = np.array(tree.talk_probabilities(**at, rate=rate, xi=xi, split_function=function))
-    sample = tree.talk_candidates(**at, rate=rate, xi=xi, seed=seed, split_function=function)
+    exact = np.array(tree.splitting_probabilities(**at, rate=rate, xi=xi, split_function=function))
+    sample = tree.splitting_candidates(**at, rate=rate, xi=xi, seed=seed, split_function=function)
     assert_valid_candidates(sample, count)
     levels = 64 + math.ceil(math.log2(count))
     assert abs(len(sample[0]) - exact.sum()) <= 8 * levels * EPSILON * count
@@ -417,14 +418,14 @@ def test_sum_is_unbiased_in_extreme_scenes(lights):
     )
 
 
-# ------------------------------------------------------------------ stochastic splitting (talk)
+# ------------------------------------------------- splitting of nodes (talk, adaptive_splitting)
 
 every_function = pytest.mark.parametrize("function", SPLIT_FUNCTIONS)
 
 
 def talk_probabilities(tree, at, rate, xi, function):
     """Probabilities given xi, in double precision."""
-    p = tree.talk_probabilities(**at, rate=rate, xi=xi, split_function=function)
+    p = tree.splitting_probabilities(**at, rate=rate, xi=xi, split_function=function)
     return np.array(p, float)
 
 
@@ -441,7 +442,7 @@ def test_talk_frequencies_given_xi(at, function):
         tools.assert_binomial(counts, TRIALS // 4, np.minimum(exact, 1))
 
 
-@every_function
+@pytest.mark.parametrize("function", STOCHASTIC)
 def test_planted_wrong_talk_frequencies_are_found(function):
     """The probabilities of another xi do not describe the samples."""
     tree, at = make_tree(*random_lights(100)), RECEIVERS["below"]
@@ -449,6 +450,29 @@ def test_planted_wrong_talk_frequencies_are_found(function):
     counts = selection_counts(draw_talk(tree, at, 1.0, TRIALS // 4, function, 0.02), 100)
     with pytest.raises(AssertionError, match="frequencies differ"):
         tools.assert_binomial(counts, TRIALS // 4, np.minimum(exact, 1))
+
+
+def test_planted_wrong_frequencies_of_variance_are_found():
+    """The probabilities of another rate do not describe the samples."""
+    tree, at = make_tree(*random_lights(100)), RECEIVERS["below"]
+    exact = talk_probabilities(tree, at, 0.3, 0.5, "variance")
+    counts = selection_counts(draw_talk(tree, at, 1.0, TRIALS // 4, "variance"), 100)
+    with pytest.raises(AssertionError, match="frequencies differ"):
+        tools.assert_binomial(counts, TRIALS // 4, np.minimum(exact, 1))
+
+
+@every_receiver
+def test_splitting_by_variance_is_deterministic(at):
+    """The cut does not depend on the random number, and is the same in other units."""
+    lights = random_lights(300)
+    exact = talk_probabilities(make_tree(*lights), at, 1.0, 0.0, "variance")
+    assert (talk_probabilities(make_tree(*lights), at, 1.0, 0.9, "variance") == exact).all()
+    mean, flux, axis, variance = lights
+    larger = make_tree(8 * mean, 4 * flux, axis, 64 * variance)
+    moved = {**at, "p": (8 * np.asarray(at["p"])).astype(np.float32)}
+    np.testing.assert_allclose(
+        talk_probabilities(larger, moved, 1.0, 0.0, "variance"), exact, rtol=1e-4
+    )
 
 
 @every_function
@@ -501,9 +525,9 @@ def test_talk_splits_less_for_larger_xi(at, function):
 
 
 def test_unknown_split_function_is_refused():
-    """The message names the two that exist."""
+    """The message names those that exist."""
     tree = make_tree(*random_lights(5))
-    with pytest.raises(ValueError, match=r'"near" or "far"'):
+    with pytest.raises(ValueError, match='"near", "far" or "variance"'):
         draw_talk(tree, RECEIVERS["below"], 1.0, 1, "middle")
 
 

@@ -78,6 +78,7 @@ PARAMETERS = (
     {"splitting_rate": 4, "reservoirs": 8, "shadow_rays": 1, "bsdf_samples": 0},
 )
 METHODS = ("resampled_tree", "talk")
+OTHER_METHODS = ("adaptive_splitting", "tree", "exhaustive")
 
 
 def parameter_id(parameters):
@@ -171,6 +172,30 @@ def test_mean_of_talk_method(llvm, name):
     assert_unbiased(name, llvm, ("exhaustive",), method="talk")
 
 
+@pytest.mark.parametrize(
+    "name", ["points", "spots", "textured", "mixed", "material-roughconductor"]
+)
+@pytest.mark.parametrize("method", OTHER_METHODS)
+def test_mean_of_other_methods(llvm, method, name):
+    """Those that are there for comparison have the same mean, too."""
+    assert_unbiased(name, llvm, ("exhaustive",), method=method)
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"splitting_rate": 0},
+        {"splitting_rate": 4},
+        {"splitting_rate": INFINITY},
+        {"bsdf_samples": 0},
+    ],
+    ids=parameter_id,
+)
+def test_mean_of_adaptive_splitting_does_not_depend_on_parameters(llvm, parameters):
+    """Every cut has the same mean."""
+    assert_unbiased("mixed", llvm, ("exhaustive",), method="adaptive_splitting", **parameters)
+
+
 @pytest.mark.parametrize("name", ["mirrored", "mesh-smooth", "hard-spots", "many-suns"])
 def test_light_samples_reach_all_light(llvm, name):
     """Without BSDF samples nothing can make up for light that is never sampled."""
@@ -247,7 +272,7 @@ def plane_lights(count=40):
     return lights
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", METHODS + OTHER_METHODS)
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 def test_mean_equals_closed_form(variant, method):
     """Point and spot lights above a plane, against quadrature without Mitsuba, pixel by pixel."""

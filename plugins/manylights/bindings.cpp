@@ -42,9 +42,13 @@ Receiver<float> receiver(const Place &p, const Place &n, bool transmits) {
 }
 
 SplitFunction split_function(const std::string &name) {
-    if (name != "near" && name != "far")
-        throw nb::value_error("split_function must be \"near\" or \"far\"");
-    return name == "near" ? SplitFunction::Near : SplitFunction::Far;
+    if (name == "near")
+        return SplitFunction::Near;
+    if (name == "far")
+        return SplitFunction::Far;
+    if (name == "variance")
+        return SplitFunction::Variance;
+    throw nb::value_error("split_function must be \"near\", \"far\" or \"variance\"");
 }
 
 class Tree {
@@ -90,22 +94,24 @@ public:
                        seed);
     }
 
-    /// The talk's stochastic splitting for the random number xi
-    Choices talk_candidates(const Place &p, const Place &n, float rate, float xi,
-                            uint64_t seed, const std::string &function,
-                            bool transmits) const {
-        return collect(StochasticCursor<float>(rate, xi, split_function(function)),
-                       receiver(p, n, transmits), seed);
+    /// Splitting of nodes for the random number xi
+    Choices splitting_candidates(const Place &p, const Place &n, float rate, float xi,
+                                 uint64_t seed, const std::string &function,
+                                 bool transmits) const {
+        auto at = receiver(p, n, transmits);
+        return collect(
+            SplittingCursor<float>(m_view, at, rate, xi, split_function(function)), at,
+            seed);
     }
 
-    /// Probability that each light is a candidate of the talk's splitting, given xi
-    std::vector<float> talk_probabilities(const Place &p, const Place &n, float rate,
-                                          float xi, const std::string &function,
-                                          bool transmits) const {
-        StochasticCursor<float> cursor(rate, xi, split_function(function));
+    /// Probability that each light is a candidate of that, given xi
+    std::vector<float> splitting_probabilities(const Place &p, const Place &n, float rate,
+                                               float xi, const std::string &function,
+                                               bool transmits) const {
+        auto at = receiver(p, n, transmits);
+        SplittingCursor<float> cursor(m_view, at, rate, xi, split_function(function));
         return for_each_light([&](uint32_t light) {
-            return cursor.inclusion_probability(m_view, receiver(p, n, transmits), light,
-                                                true);
+            return cursor.inclusion_probability(m_view, at, light, true);
         });
     }
 
@@ -221,12 +227,12 @@ NB_MODULE(_core, m) {
              "Systematic sampling with K = expected and the random number u: lights and "
              "the "
              "probabilities with which they are candidates.")
-        .def("talk_candidates", &Tree::talk_candidates, "p"_a, "n"_a, "rate"_a, "xi"_a,
-             "seed"_a = 0, "split_function"_a = "near", "transmits"_a = false,
+        .def("splitting_candidates", &Tree::splitting_candidates, "p"_a, "n"_a, "rate"_a,
+             "xi"_a, "seed"_a = 0, "split_function"_a = "near", "transmits"_a = false,
              "Stochastic splitting with the random number xi: lights, probabilities "
              "given xi.")
-        .def("talk_probabilities", &Tree::talk_probabilities, "p"_a, "n"_a, "rate"_a,
-             "xi"_a, "split_function"_a = "near", "transmits"_a = false,
+        .def("splitting_probabilities", &Tree::splitting_probabilities, "p"_a, "n"_a,
+             "rate"_a, "xi"_a, "split_function"_a = "near", "transmits"_a = false,
              "Probability (N) that each light is a candidate of stochastic splitting, "
              "given xi.")
         .def_prop_ro("depth", &Tree::depth, "Levels of the 4-wide tree.")

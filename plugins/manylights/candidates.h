@@ -3,14 +3,16 @@
 /**
  * Candidates: the N' lights that a shading point considers, one after the other.
  *
- * Three sources with one interface, used by the loop in direct_light.h:
+ * Three sources with one interface, used by the loops in direct_light.h:
  *
  *     Mask has_next() const;                 is there another candidate?
  *     Candidate next(tree, receiver, rng);   find it and move on
+ *     UInt32 visits;                         nodes visited so far (drops out if unused)
  *
  * - \ref AllLights: every light, with probability 1 (few lights, or infinite rate).
  * - \ref SystematicCursor: systematic sampling of the tree (default).
- * - \ref StochasticCursor: the talk's stochastic splitting (method `talk`).
+ * - \ref SplittingCursor: splitting of a binary tree's nodes (methods `talk` and
+ *   `adaptive_splitting`).
  *
  * Candidates of one point are always distinct lights.
  */
@@ -39,8 +41,10 @@ constexpr float kCandidatesPerRate = 8.f;
 template <typename Float> struct AllLights {
     using UInt32 = dr::uint32_array_t<Float>;
 
-    UInt32 index, count;
-    DRJIT_STRUCT(AllLights, index, count)
+    UInt32 index, count, visits;
+    DRJIT_STRUCT(AllLights, index, count, visits)
+
+    explicit AllLights(const UInt32 &count) : index(0), count(count), visits(0) {}
 
     auto has_next() const { return index < count; }
 
@@ -81,12 +85,12 @@ template <typename Float> struct SystematicCursor {
     Float expected, offset, k;
     /// Remembered nodes, the deepest first; width 0 marks an empty entry
     Place trail0, trail1;
-    UInt32 last_leaf;
-    DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1, last_leaf)
+    UInt32 last_leaf, visits;
+    DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1, last_leaf, visits)
 
     SystematicCursor(const Float &expected, const Float &u)
         : expected(expected), offset(u), k(0.f), trail0(root(0.f)), trail1(root(0.f)),
-          last_leaf(kNone) {}
+          last_leaf(kNone), visits(0) {}
 
     Mask has_next() const { return holds(root(1.f), k); }
 
@@ -96,20 +100,25 @@ template <typename Float> struct SystematicCursor {
         struct Descent {
             Place place, trail0, trail1;
             Float x, dither;
-            DRJIT_STRUCT(Descent, place, trail0, trail1, x, dither)
+            UInt32 visits;
+            DRJIT_STRUCT(Descent, place, trail0, trail1, x, dither, visits)
         };
 
         // By rounding, a remembered node may miss the point by a hair: then start at the root
         Mask remembered = trail0.width > 0.f && holds(trail0, k);
         Descent d{ dr::select(remembered, trail0, root(1.f)),
-                   dr::select(remembered, trail1, root(0.f)), root(0.f), Float(0.f),
-                   rng.template next_float<Float>() };
+                   dr::select(remembered, trail1, root(0.f)),
+                   root(0.f),
+                   Float(0.f),
+                   rng.template next_float<Float>(),
+                   visits };
         d.x = inside(((k + offset) / expected - d.place.lower) / d.place.width);
 
         loop(
             d, [](const Descent &s) { return (s.place.node & kLeafBit) == 0u; },
             [&](Descent &s) { descend(tree, at, s); }, "Light tree: descent");
 
+        visits = d.visits;
         trail0 = d.trail0;
         trail1 = d.trail1;
         k      = next_point(d.place.lower + d.place.width);
@@ -157,37 +166,59 @@ private:
         Float x     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
         s.x = dr::select(single, inside(x - dr::select(x >= 1.f, Float(1.f), 0.f)), s.x);
         s.place = child;
+        s.visits += 1u;
     }
 };
 
-/// The talk's two split functions: how fast the probability of splitting decays
-enum class SplitFunction { Near, Far };
+/// What decides whether a node is split: the talk's two functions, or the variance
+enum class SplitFunction { Near, Far, Variance };
 
 /// Lower limit of r/d: coincident lights (r = 0) can still be told apart
 constexpr float kMinSpread = 1e-3f;
 
 /**
- * The talk's stochastic splitting: one number xi for the whole traversal; a node is split
- * if xi < P(node), and below a node that is not split one light is chosen at random. With
- * r half the diagonal of a node's box and d its distance,
+ * Splitting of the nodes of a binary tree, one by one: a node is split if xi < P(node),
+ * and below a node that is not split one light is chosen at random. The number xi is the
+ * same for the whole traversal.
+ *
+ * The talk splits stochastically. With r half the diagonal of a node's box, d its distance
+ * and g the rate,
  *
  *     near: P = g (r/d)^2 / (1 + g (r/d)^2),    far: P = g (r/d) / (1 + g (r/d)),
  *
  * readings of section 3, whose supplement is not public. The second extends further away.
+ *
+ * Adaptive tree splitting (Conty Estevez and Kulla 2018, section 5) splits where the
+ * light of a cluster varies too much, so P is 0 or 1. For distances spread evenly over
+ * [a, b] the squared falloff has the standard deviation (b - a) / (ab sqrt(3 ab)); times
+ * the cluster's flux this must be below 1 / (8 g) of all light that arrives. (Published
+ * is an absolute limit in the scene's units, and a term for lights of unequal flux.)
+ *
  * The traversal is stackless: a cut node's `escape` is where it goes on.
  */
-template <typename Float> struct StochasticCursor {
+template <typename Float> struct SplittingCursor {
     using UInt32 = dr::uint32_array_t<Float>;
     using Mask   = dr::mask_t<Float>;
 
     Float rate, xi;
-    UInt32 node;
-    DRJIT_STRUCT(StochasticCursor, rate, xi, node)
+    UInt32 node, visits;
+    DRJIT_STRUCT(SplittingCursor, rate, xi, node, visits)
 
     SplitFunction function = SplitFunction::Near;
 
-    StochasticCursor(const Float &rate, const Float &u, SplitFunction function)
-        : rate(rate), xi(u), node(0), function(function) {}
+    /// `u` is the random number of the traversal; with the variance it does not matter
+    SplittingCursor(const TreeView<Float> &tree, const Receiver<Float> &at,
+                    const Float &rate, const Float &u, SplitFunction function)
+        : rate(rate), xi(u), node(0), visits(0), function(function) {
+        if (function != SplitFunction::Variance)
+            return;
+        // Of all the light, which has a flux of 1, about 1 / distance^2 arrives
+        BinaryView root(tree, UInt32(0));
+        Float d2(root.data.entry(9));
+        for (size_t i = 0; i < 3; ++i)
+            d2 += dr::square(root.data.entry(6 + i) - at.p.entry(i));
+        this->rate = kCandidatesPerRate * rate * d2;
+    }
 
     Mask has_next() const { return node != kNone; }
 
@@ -195,14 +226,13 @@ template <typename Float> struct StochasticCursor {
     Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at,
                           Rng &rng) {
         struct Descent {
-            UInt32 node, resume;
+            UInt32 node, resume, visits;
             Float x, probability;
             Mask cut;
-            DRJIT_STRUCT(Descent, node, resume, x, probability, cut)
+            DRJIT_STRUCT(Descent, node, resume, visits, x, probability, cut)
         };
-        Descent d{ node, UInt32(0), rng.template next_float<Float>(), Float(1.f),
-                   Mask(false) };
-        d.resume = node;
+        Descent d{ node,       node,       visits, rng.template next_float<Float>(),
+                   Float(1.f), Mask(false) };
         loop(
             d, [](const Descent &s) { return (s.node & kLeafBit) == 0u; },
             [&](Descent &s) {
@@ -222,9 +252,11 @@ template <typename Float> struct StochasticCursor {
                 s.probability = dr::select(step, s.probability * q, s.probability);
                 s.node        = dr::select(leaf, view.light | kLeafBit,
                                            dr::select(left, s.node + 1u, view.right));
+                s.visits += 1u;
             },
-            "Light tree: stochastic splitting");
-        node = d.resume;
+            "Light tree: splitting");
+        node   = d.resume;
+        visits = d.visits;
         return { d.node & ~kLeafBit, d.probability, d.probability > 0.f };
     }
 
@@ -280,8 +312,16 @@ private:
             d2 += dr::square(at.p.entry(i) - dr::clip(at.p.entry(i), low, high));
             r2 += .25f * dr::square(high - low);
         }
-        Float spread2 = dr::clip(r2 / d2, kMinSpread * kMinSpread, 1e12f);
-        Float g = rate * (function == SplitFunction::Near ? spread2 : dr::sqrt(spread2));
+        Float spread2 = dr::clip(r2 / d2, kMinSpread * kMinSpread, 1e12f), g;
+        if (function == SplitFunction::Variance) {
+            // a = d, b = d + 2 r
+            Float b_a     = 1.f + 2.f * dr::sqrt(spread2), // b / a
+                deviation = (b_a - 1.f) * dr::rsqrt(3.f * b_a) / (b_a * d2);
+            Mask split =
+                rate * view.data.entry(10) * deviation > 1.f || (rate > 0.f && d2 <= 0.f);
+            return dr::select(split, Float(1.f), 0.f);
+        }
+        g = rate * (function == SplitFunction::Near ? spread2 : dr::sqrt(spread2));
         // The root's box holds all others, so P decreases with depth on every path
         return dr::select(d2 > 0.f, 1.f - dr::rcp(1.f + g),
                           dr::select(rate > 0.f, Float(1.f), 0.f));

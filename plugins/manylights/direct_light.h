@@ -60,7 +60,7 @@ public:
         m_keep_all = most <= (float) params.reservoirs;
         m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
         m_items    = m_slots + infinite_items();
-        m_choose   = m_items > params.shadow_rays_deeper();
+        m_choose   = !params.traces_all() && m_items > params.shadow_rays_deeper();
     }
 
     const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
@@ -100,10 +100,13 @@ public:
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
-    Spectrum sample_lights(const Vertex &vertex, Mask active) const {
+    Spectrum sample_lights(const Vertex &vertex, Counts<Float> &counts,
+                           Mask active) const {
         if (m_items == 0)
             return Spectrum(0.f);
-        return trace_kept(vertex, keep_lights(vertex, active), active);
+        if (m_params.traces_all())
+            return trace_candidates(vertex, counts, active);
+        return trace_kept(vertex, keep_lights(vertex, counts, active), active);
     }
 
     /// Radiance that arrives along rays sampled from the BSDF
@@ -210,40 +213,37 @@ private:
     // --------------------------------------------------------------- Stages 1 and 2
 
     /// Choices are not differentiated: no gradient passes through here
-    Kept keep_lights(const Vertex &vertex, Mask active) const {
+    Kept keep_lights(const Vertex &vertex, Counts<Float> &counts, Mask active) const {
         dr::suspend_grad<Float> detached;
         LightSample<FloatD> u = plain_sample(vertex.u);
+        auto keep             = [&](const auto &cursor) {
+            return m_keep_all
+                       ? keep_candidates(vertex, cursor, u, counts, active)
+                       : keep_resampled(vertex,
+                                        resample(vertex.at, cursor, u, counts, active),
+                                        active);
+        };
         if (m_all)
-            return keep(
-                vertex,
-                AllLights<FloatD>{ UInt32D(0), dr::opaque<UInt32D>(light_count()) }, u,
-                active);
-        if (m_params.method == Method::Talk)
-            return keep(vertex, talk_cursor(u.tree), u, active);
-        return keep(vertex, SystematicCursor<FloatD>(vertex.effort.candidates, u.tree), u,
-                    active);
-    }
-
-    template <typename Cursor>
-    Kept keep(const Vertex &vertex, const Cursor &cursor, const LightSample<FloatD> &u,
-              Mask active) const {
-        return m_keep_all
-                   ? keep_candidates(vertex, cursor, u, active)
-                   : keep_resampled(vertex, resample(vertex.at, cursor, u, plain(active)),
-                                    active);
+            return keep(AllLights<FloatD>(dr::opaque<UInt32D>(light_count())));
+        if (m_params.splits_nodes())
+            return keep(splitting_cursor(vertex.at, u.tree));
+        return keep(SystematicCursor<FloatD>(vertex.effort.candidates, u.tree));
     }
 
     uint32_t light_count() const { return m_lights.tree().light_count; }
 
-    StochasticCursor<FloatD> talk_cursor(const FloatD &xi) const {
-        return { dr::opaque<FloatD>(m_params.splitting_rate), xi,
-                 m_params.split_function };
+    SplittingCursor<FloatD> splitting_cursor(const Receiver<FloatD> &at,
+                                             const FloatD &u) const {
+        return { m_lights.tree(), at, dr::opaque<FloatD>(m_params.splitting_rate), u,
+                 m_params.method == Method::Talk ? m_params.split_function
+                                                 : SplitFunction::Variance };
     }
 
     /// No more candidates than slots: keep each with C = 1 / p
     template <typename Cursor>
     Kept keep_candidates(const Vertex &vertex, const Cursor &cursor,
-                         const LightSample<FloatD> &u, Mask active) const {
+                         const LightSample<FloatD> &u, Counts<Float> &counts,
+                         Mask active) const {
         struct State {
             Cursor cursor;
             Kept kept;
@@ -274,33 +274,39 @@ private:
                 s.slot += dr::select(valid, UInt32D(1), UInt32D(0));
             },
             "Direct light: candidates");
+        counts.add(state.slot, state.cursor.visits, active);
         return std::move(state.kept);
     }
 
     /// Stage 2: deal the candidates to m reservoirs
     template <typename Cursor>
     Reservoirs<FloatD> resample(const Receiver<FloatD> &at, const Cursor &cursor,
-                                const LightSample<FloatD> &u, const MaskD &active) const {
+                                const LightSample<FloatD> &u, Counts<Float> &counts,
+                                Mask active) const {
         struct State {
             Cursor cursor;
             Reservoirs<FloatD> reservoirs;
             Rng rng;
-            DRJIT_STRUCT(State, cursor, reservoirs, rng)
+            UInt32D candidates;
+            DRJIT_STRUCT(State, cursor, reservoirs, rng, candidates)
             State(const Cursor &cursor, size_t count, Rng &&rng)
-                : cursor(cursor), reservoirs(count), rng(std::move(rng)) {}
+                : cursor(cursor), reservoirs(count), rng(std::move(rng)), candidates(0) {}
         };
         const auto &tree = m_lights.tree();
         Dealing dealing =
             m_params.method == Method::Talk ? Dealing::Random : Dealing::Greedy;
         State state(cursor, m_slots, make_rng(u));
+        MaskD on = plain(active);
         loop(
-            state, [&](const State &s) { return active && s.cursor.has_next(); },
+            state, [&](const State &s) { return on && s.cursor.has_next(); },
             [&](State &s) {
                 auto candidate = s.cursor.next(tree, at, s.rng);
                 FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds);
                 s.reservoirs.add(candidate, h, m_slots, dealing, s.rng);
+                s.candidates += 1u;
             },
             "Direct light: resampled candidates");
+        counts.add(state.candidates, state.cursor.visits, active);
         return std::move(state.reservoirs);
     }
 
@@ -395,6 +401,51 @@ private:
         return state.result;
     }
 
+    /// Method `adaptive_splitting`: no resampling, a shadow ray for every candidate
+    Spectrum trace_candidates(const Vertex &vertex, Counts<Float> &counts,
+                              Mask active) const {
+        if (m_all)
+            return trace_candidates(vertex,
+                                    AllLights<FloatD>(dr::opaque<UInt32D>(light_count())),
+                                    counts, active);
+        return trace_candidates(vertex, splitting_cursor(vertex.at, plain(vertex.u.tree)),
+                                counts, active);
+    }
+
+    template <typename Cursor>
+    Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor,
+                              Counts<Float> &counts, Mask active) const {
+        struct State {
+            Cursor cursor;
+            UInt32D slot;
+            Spectrum result;
+            Rng rng;
+            DRJIT_STRUCT(State, cursor, slot, result, rng)
+            State(const Cursor &cursor, Rng &&rng)
+                : cursor(cursor), slot(0), result(0.f), rng(std::move(rng)) {}
+        };
+        State state(cursor, make_rng(plain_sample(vertex.u)));
+        MaskD on = plain(active);
+        loop(
+            state, [&](const State &s) { return on && s.cursor.has_next(); },
+            [&](State &s) {
+                auto candidate = s.cursor.next(m_lights.tree(), vertex.at, s.rng);
+                FloatD p       = candidate.probability;
+                Mask valid     = active && candidate.valid;
+                Sample sample  = sample_light_point(vertex, candidate.light, p, s.slot,
+                                                    /* target_only = */ false, valid);
+                sample.value *= Float(dr::rcp(p));
+                s.result += trace_sample(vertex, sample, s.rng, valid);
+                s.slot += 1u;
+            },
+            "Direct light: rays to all candidates");
+        counts.add(state.slot, state.cursor.visits, active);
+        InfiniteSamples infinite = sample_infinite(vertex, active);
+        for (size_t i = 0; i < infinite_items(); ++i)
+            state.result += trace_sample(vertex, infinite[i], state.rng, active);
+        return state.result;
+    }
+
     /// The chosen item's contribution, with visibility
     Spectrum trace(const Vertex &vertex, const Kept &kept,
                    const InfiniteSamples &infinite, const Selected<FloatD> &chosen,
@@ -415,6 +466,11 @@ private:
             sample = dr::select(active && chosen.item == (uint32_t) (m_slots + i),
                                 infinite[i], sample);
 
+        return trace_sample(vertex, sample, rng, active);
+    }
+
+    Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,
+                          Mask active) const {
         active &=
             Mask(Reader::target(sample.value) > 0.f); // drops invalid values as well
         if (dr::none_or<false>(active))
@@ -666,9 +722,9 @@ private:
                                  const MaskD &active) const {
         if (m_all)
             return FloatD(1.f);
-        if (m_params.method == Method::Talk)
-            return talk_cursor(u_tree).inclusion_probability(m_lights.tree(), at, light,
-                                                             active);
+        if (m_params.splits_nodes())
+            return splitting_cursor(at, u_tree)
+                .inclusion_probability(m_lights.tree(), at, light, active);
         return dr::minimum(1.f, effort(first).candidates *
                                     leaf_probability(m_lights.tree(), at, light, active));
     }

@@ -51,8 +51,30 @@ size_t read_choice(const Properties &props, const std::string &name,
     refuse(props, name, "\"" + value + "\"", allowed);
 }
 
-const std::vector<std::string> kMethods        = { "resampled_tree", "talk" };
+const std::vector<std::string> kMethods = { "resampled_tree", "talk",
+                                            "adaptive_splitting", "tree", "exhaustive" };
 const std::vector<std::string> kSplitFunctions = { "near", "far" };
+
+/// Parameters that would have no effect are mistakes
+void refuse_unused(const Properties &props, const SamplingParameters &p) {
+    auto refuse_given = [&](const char *name) {
+        if (props.has_property(name))
+            refuse(props, name, "given",
+                   "left out where \"method\" is \"" + kMethods[(size_t) p.method] +
+                       "\"");
+    };
+    bool one_descent = p.method == Method::Tree;
+    if (one_descent || p.method == Method::Exhaustive)
+        refuse_given("splitting_rate");
+    if (one_descent || p.traces_all()) {
+        refuse_given("reservoirs");
+        refuse_given("shadow_rays");
+    }
+    if (props.has_property("split_function") && p.method != Method::Talk)
+        refuse(props, "split_function",
+               "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
+               "left out unless \"method\" is \"talk\"");
+}
 
 /// What all integrators have in common
 SamplingParameters read_light_parameters(const Properties &props) {
@@ -64,10 +86,14 @@ SamplingParameters read_light_parameters(const Properties &props) {
                                   std::min(p.shadow_rays, p.reservoirs), 1, p.reservoirs);
     p.split_function =
         (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
-    if (props.has_property("split_function") && p.method != Method::Talk)
-        refuse(props, "split_function",
-               "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
-               "left out unless \"method\" is \"talk\"");
+    p.counts = props.get<bool>("counts", false);
+    refuse_unused(props, p);
+    if (p.method == Method::Exhaustive)
+        p.splitting_rate = std::numeric_limits<float>::infinity();
+    if (p.method == Method::Tree)
+        p.splitting_rate = 0.f;
+    if (p.method == Method::Tree || p.traces_all())
+        p.reservoirs = p.shadow_rays = 1;
     return p;
 }
 
@@ -86,14 +112,22 @@ SamplingParameters read_path_parameters(const Properties &props) {
     return p;
 }
 
+std::vector<std::string> count_channels(const SamplingParameters &p) {
+    if (!p.counts)
+        return {};
+    return { "candidates", "node_visits" };
+}
+
 std::string to_string(const SamplingParameters &p) {
     std::ostringstream oss;
-    oss << "method = " << kMethods[(size_t) p.method] << ",\n";
+    oss << "method = " << kMethods[(size_t) p.method];
     if (p.method == Method::Talk)
-        oss << "split_function = " << kSplitFunctions[(size_t) p.split_function] << ",\n";
-    oss << "splitting_rate = " << p.splitting_rate << ",\n"
-        << "reservoirs = " << p.reservoirs << ",\n"
-        << "shadow_rays = " << p.shadow_rays;
+        oss << ",\nsplit_function = " << kSplitFunctions[(size_t) p.split_function];
+    if (p.method != Method::Tree && p.method != Method::Exhaustive)
+        oss << ",\nsplitting_rate = " << p.splitting_rate;
+    if (p.method != Method::Tree && !p.traces_all())
+        oss << ",\nreservoirs = " << p.reservoirs << ",\nshadow_rays = " << p.shadow_rays;
+    oss << ",\ncounts = " << (p.counts ? "true" : "false");
     return oss.str();
 }
 

@@ -8,11 +8,13 @@
 #include "reservoirs.h"
 #include <cmath>
 #include <mitsuba/core/properties.h>
+#include <string>
+#include <vector>
 
 namespace manylights {
 
-/// Where candidates come from
-enum class Method { ResampledTree, Talk };
+/// Where candidates come from, and what becomes of them
+enum class Method { ResampledTree, Talk, AdaptiveSplitting, Tree, Exhaustive };
 
 /// See the documentation of the plugin manylights_direct
 struct SamplingParameters {
@@ -22,6 +24,8 @@ struct SamplingParameters {
     uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
     /// What the vertices of a path after its first one get of candidates and shadow rays
     float deeper_candidates = 1.f, deeper_rays = 1.f;
+    /// Are the candidates and the visited nodes counted, in film channels?
+    bool counts = false;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
@@ -36,9 +40,15 @@ struct SamplingParameters {
     }
     /// Upper limit of the number of candidates
     float most_candidates() const {
-        return method == Method::Talk ? std::numeric_limits<float>::infinity()
-                                      : std::ceil(expected_candidates());
+        return splits_nodes() ? std::numeric_limits<float>::infinity()
+                              : std::ceil(expected_candidates());
     }
+    /// Does it walk the binary tree, and split its nodes one by one?
+    bool splits_nodes() const {
+        return method == Method::Talk || method == Method::AdaptiveSplitting;
+    }
+    /// Does each candidate get a shadow ray?
+    bool traces_all() const { return method == Method::AdaptiveSplitting; }
     /// Is K so large that every light is visited?
     bool visits_all() const { return expected_candidates() > kMaxExpectedCandidates; }
 };
@@ -55,6 +65,9 @@ SamplingParameters read_parameters(const mitsuba::Properties &props);
  * `path` in rooms, and 6.4 / 7.7 / 9.1 / 10.1 / 9.4 times in a city of points.
  */
 SamplingParameters read_path_parameters(const mitsuba::Properties &props);
+
+/// Names of the film channels with counts
+std::vector<std::string> count_channels(const SamplingParameters &params);
 
 /// "name = value" lines
 std::string to_string(const SamplingParameters &params);

@@ -40,7 +40,8 @@ public:
 
     /// Radiance along a ray from the camera, and whether it met anything
     std::pair<Spectrum, Mask> trace(Sampler *sampler, const Ray3f &ray,
-                                    const Medium *medium, Mask active) const {
+                                    const Medium *medium, Counts<Float> &counts,
+                                    Mask active) const {
         if (m_limits.max_depth == 0)
             return { Spectrum(0.f), Mask(false) };
         State state{ sampler, ray, medium, active };
@@ -49,6 +50,7 @@ public:
         loop(
             state, [](const State &s) { return s.active; }, [&](State &s) { step(s); },
             "Paths");
+        counts = state.counts;
         // Light along a segment counts even if the path then leaves it unscattered
         return { m_media ? state.result : state.result & state.valid, state.valid };
     }
@@ -67,9 +69,10 @@ private:
         Float u_tree, pdf;
         /// Did the path leave it by a direction that light sampling cannot find?
         Mask specular;
+        Counts<Float> counts;
         Sampler *sampler;
         DRJIT_STRUCT(State, active, valid, depth, ray, pi, medium, throughput, result,
-                     eta, from, u_tree, pdf, specular, sampler)
+                     eta, from, u_tree, pdf, specular, counts, sampler)
 
         State(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
             : active(active), valid(false), depth(0), ray(ray),
@@ -214,7 +217,7 @@ private:
         piece.u_tree         = vertex.u.tree;
         piece.along.distance = plain(piece.inside.mei.t);
         dr::masked(s.result, active) =
-            s.result + s.throughput * m_direct.sample_lights(vertex, active);
+            s.result + s.throughput * m_direct.sample_lights(vertex, s.counts, active);
     }
 
     void add_direct_light(State &s, const Vertex &vertex, const Piece &piece,
@@ -227,7 +230,7 @@ private:
                 lit |= here && vertex.inside->medium->use_emitter_sampling();
         }
         if (dr::any_or<true>(lit))
-            add(s, m_direct.sample_lights(vertex, lit), piece, lit);
+            add(s, m_direct.sample_lights(vertex, s.counts, lit), piece, lit);
     }
 
     /// Add radiance of the vertex at the end of a piece

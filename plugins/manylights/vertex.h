@@ -25,6 +25,25 @@ template <typename Float> struct Effort {
     dr::uint32_array_t<Float> shadow_rays;
 };
 
+/// What light sampling did, for those who ask: where nobody does, it drops out of kernels
+template <typename Float> struct Counts {
+    using FloatD      = dr::detached_t<Float>;
+    FloatD candidates = FloatD(0.f), node_visits = FloatD(0.f);
+    DRJIT_STRUCT(Counts, candidates, node_visits)
+
+    template <typename UInt32>
+    void add(const UInt32 &found, const UInt32 &visits, const dr::mask_t<Float> &active) {
+        auto on = plain(active);
+        candidates += dr::select(on, FloatD(found), 0.f);
+        node_visits += dr::select(on, FloatD(visits), 0.f);
+    }
+    /// Film channels
+    void write(Float *aovs) const {
+        aovs[0] = Float(candidates);
+        aovs[1] = Float(node_visits);
+    }
+};
+
 /// The medium that surrounds a path, and where it scatters therein
 template <typename Float, typename Spectrum> struct InMedium {
     MI_IMPORT_TYPES(MediumPtr)

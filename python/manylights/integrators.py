@@ -16,13 +16,14 @@ from manylights.errors import UsageError
 #: Our plugins: direct light on surfaces, and paths through surfaces and media.
 DIRECT, VOLPATH = "manylights_direct", "manylights_volpath"
 
-#: What both plugins accept to steer the choice of lights.
+#: What both plugins accept to steer and to watch the choice of lights.
 SAMPLING_PARAMETERS = {
     "splitting_rate": "float >= 0 or inf, default 1",
     "reservoirs": "integer from 1 to 64, default 8",
     "shadow_rays": "integer from 1 to the number of reservoirs, default 4",
-    "method": "resampled_tree or talk, default resampled_tree",
+    "method": "resampled_tree, talk, adaptive_splitting, tree or exhaustive, default resampled_tree",
     "split_function": "near or far, default near, for method=talk only",
+    "counts": "true or false, default false, adds channels candidates and node_visits",
 }
 
 #: What each plugin accepts, for error messages and help. The plugins themselves check the values.
