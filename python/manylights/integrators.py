@@ -21,7 +21,7 @@ SAMPLING_PARAMETERS = {
     "splitting_rate": "float >= 0 or inf, default 1",
     "reservoirs": "integer from 1 to 64, default 8",
     "shadow_rays": "integer from 1 to the number of reservoirs, default 4",
-    "method": "resampled_tree, talk, adaptive_splitting, tree or exhaustive, default resampled_tree",
+    "method": "resampled_tree, talk, adaptive_splitting, tree, exhaustive, default resampled_tree",
     "split_function": "near or far, default near, for method=talk only",
     "counts": "true or false, default false, adds channels candidates and node_visits",
 }
