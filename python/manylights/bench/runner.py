@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,6 +133,8 @@ class SceneRun:
         self.entry = self._entry()
         self.weights = power_weights(self.loaded.scene)
         self.reference = np.zeros(0)
+        # Methods whose tree would be built again by the next render.
+        self.stale: set[str] = set()
 
     def run(self) -> None:
         """Do everything that is missing."""
@@ -174,14 +175,26 @@ class SceneRun:
         )
 
     def _draw(self, candidate: Candidate, spp: int, seed: int) -> Drawing:
-        method, scene = candidate.method, self.loaded.scene
-        by_power = method.name == "power"
-        with power_sampling(scene, self.weights) if by_power else nullcontext():
-            try:
-                return draw(self.loaded, candidate.integrator, spp, seed)
-            except RuntimeError as error:
-                where = f"{self.entry['name']}, {method.spec}"
-                raise UsageError(f"{where}: {one_line(error)}") from error
+        method = candidate.method
+        try:
+            if method.name == "power":
+                return self._draw_by_power(candidate, spp, seed)
+            if method.spec in self.stale:
+                draw(self.loaded, candidate.integrator, 1, CALIBRATION_SEED)
+                self.stale.discard(method.spec)
+            return draw(self.loaded, candidate.integrator, spp, seed)
+        except RuntimeError as error:
+            where = f"{self.entry['name']}, {method.spec}"
+            raise UsageError(f"{where}: {one_line(error)}") from error
+
+    def _draw_by_power(self, candidate: Candidate, spp: int, seed: int) -> Drawing:
+        scene = self.loaded.scene
+        with power_sampling(scene, self.weights):
+            drawing = draw(self.loaded, candidate.integrator, spp, seed)
+        # Mitsuba tells environments about each change, which makes them look new to our trees.
+        if scene.environment() is not None:
+            self.stale = {method.spec for method in self.job.methods if method.is_ours}
+        return drawing
 
     def _attempt(self, candidate: Candidate, step: Callable[[Candidate], Any]) -> bool:
         """Do a step with a method; if pixels are no numbers, note that and return False."""
