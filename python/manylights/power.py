@@ -82,6 +82,8 @@ def _check_probabilities(scene, weights: np.ndarray) -> None:
     else:
         found = np.array(scene.pdf_emitter(dr.arange(mi.UInt32, count)))
     expected = weights / weights.sum()
+    # Without weights Mitsuba returns one number for all.
+    found = np.broadcast_to(found, count)
     # Single precision, and sums of as many numbers as there are emitters.
     if not np.allclose(found, expected, rtol=1e-3, atol=1e-7):
         worst = int(np.argmax(np.abs(found - expected)))

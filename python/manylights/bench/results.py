@@ -52,7 +52,11 @@ class Results:
     def write_image(self, scene: str, name: str, pixels: np.ndarray, channels: list[str]) -> None:
         """Write ``SCENE/NAME.exr``, whole or not at all, in single precision."""
         target = self.folder / scene / f"{name}.exr"
-        bitmap = mi.Bitmap(np.ascontiguousarray(pixels, np.float32), channel_names=channels)
+        size = [pixels.shape[1], pixels.shape[0]]
+        formats, kind = mi.Bitmap.PixelFormat, mi.Struct.Type.Float32
+        # Made of an array, a bitmap calls its channels Y and A or R, G and B.
+        bitmap = mi.Bitmap(formats.MultiChannel, kind, size, len(channels), channels)
+        np.array(bitmap, copy=False)[:] = pixels
         with self.writing:
             images.write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)
 

@@ -16,6 +16,7 @@ import hashlib
 import inspect
 import json
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,7 @@ def _file(path: str, defines: dict[str, str]) -> Source:
 def _files_of(path: str, state) -> list[Path]:
     """Return the XML files of a parsed scene and the files that it refers to."""
     folder = Path(path).resolve().parent
-    files = [Path(file) for file in state.files]
+    files = [Path(str(file)) for file in state.files]
     for node in state.nodes:
         for _, value in node.props.items():
             if isinstance(value, str) and value and (folder / value).is_file():
@@ -200,9 +201,21 @@ def _generate(text: str, name: str, arguments: dict[str, Any]) -> dict:
     if "n_lights" not in inspect.signature(generator).parameters:
         arguments = {key: value for key, value in arguments.items() if key != "n_lights"}
     try:
-        return generator(**{**defaults, **arguments})
+        with _quiet():
+            return generator(**{**defaults, **arguments})
     except (TypeError, ValueError) as error:
         raise UsageError(f"{text}: {one_line(error)}") from error
+
+
+@contextmanager
+def _quiet():
+    """Keep Mitsuba from warning of textures brighter than 1, which are light here."""
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
 
 
 def _describe(
