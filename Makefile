@@ -41,13 +41,14 @@ test: $(INSTALLED)  ## Run the quick tests
 test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
+# Without HOME nothing is taken from Dr.Jit's cache on disk: first renders compile.
 .PHONY: bench
 bench: $(INSTALLED)  ## Measure all methods on the standard scenes (an hour) into bench/
-	$(BIN)/manylights bench --standard --out bench $(ARGS)
+	env -u HOME $(BIN)/manylights bench --standard --out bench $(ARGS)
 
 .PHONY: bench-quick
 bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
-	$(BIN)/manylights bench --quick --out bench-quick $(ARGS)
+	env -u HOME $(BIN)/manylights bench --quick --out bench-quick $(ARGS)
 
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling

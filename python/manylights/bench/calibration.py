@@ -1,7 +1,8 @@
 """Finds out how long a method takes, and how many samples fit into a time.
 
-Every kind of render is done once before it counts: Mitsuba compiles a kernel for one sample, one
-for powers of two and one for all other numbers.
+Every kind of render is done once before it counts: Mitsuba compiles a kernel for powers of two of
+samples and another one for all other numbers. Noise of the machine only ever makes a render slower,
+so the shorter of two times is used where it matters.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from collections.abc import Callable
 #: The render time of one sample, in budgets, from which on a method is not measured.
 PATIENCE = 20.0
 
-#: Numbers of samples from which on no new kernel is compiled.
-LAST_NEW_KERNEL = 4
+#: Renders of more samples than this are long enough to be measured once.
+FEW_SAMPLES = 4
 
 #: An equal-time rendering is made if one sample takes at most so many times the time.
 TOLERANCE = 1.5
@@ -25,7 +26,7 @@ Measure = Callable[[int], float]
 def steady_seconds(measure: Measure, spp: int) -> float:
     """Return the render time of ``spp`` samples, without compilation."""
     seconds = measure(spp)
-    return min(seconds, measure(spp)) if spp <= LAST_NEW_KERNEL else seconds
+    return min(seconds, measure(spp)) if spp <= FEW_SAMPLES else seconds
 
 
 def ladder(measure: Measure, budget: float, largest: int | None = None) -> dict[int, float]:
@@ -48,6 +49,8 @@ def ladder(measure: Measure, budget: float, largest: int | None = None) -> dict[
         if too_many or _lower_bound(times, spp) > budget:
             return times
         seconds = steady_seconds(measure, spp)
+        if seconds > budget:
+            seconds = min(seconds, measure(spp))
         if seconds > budget:
             return times
         times[spp] = seconds

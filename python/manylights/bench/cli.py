@@ -20,8 +20,9 @@ scene's weights, or in proportion to their power; the others are methods of ours
 
 Each method is rendered with several numbers of samples and seeds, and once with as many
 samples as take the time budget. Times are those of later renders; that of the first one,
-with compilation, and that of building the tree are kept apart. Compiled kernels of earlier
-processes are used again, if Mitsuba finds them in its cache.
+with compilation, and that of building the tree are kept apart. Dr.Jit takes kernels that it
+compiled in earlier processes from ~/.drjit; run "env -u HOME manylights bench ..." to have
+all of them compiled.
 
 DIR/results.json has all numbers. Ctrl-C keeps what was measured, and the same command goes
 on: the same scene, variant, method, samples and seed are not rendered again. To add

@@ -119,9 +119,11 @@ def run(
             work.expect(job.source.text, 0.0)
             continue
         SceneRun(job, settings, found, work).run()
-        # Virtual calls of later scenes would include the emitters of this one.
+        # Virtual calls of later scenes would include the emitters of this one; and kernels in
+        # memory would make later first renders quick.
         gc.collect()
         dr.flush_malloc_cache()
+        dr.flush_kernel_cache()
 
 
 class SceneRun:
