@@ -266,7 +266,8 @@ def test_a_given_reference_is_used(measured, tmp_path):
     status, data = bench(tmp_path, CITY, *FEW, "--reference", path)
     assert status == 0
     reference = data["scenes"][0]["reference"]
-    assert reference["spp"] is None and reference["error"] is None
+    assert (reference["integrator"], reference["spp"]) == ("reference.exr", 0)
+    assert reference["error"] == reference["mean_error"] == 0
     assert reference["mean"] == pytest.approx(
         measured[1]["scenes"][0]["reference"]["mean"], rel=1e-5
     )
@@ -529,6 +530,7 @@ def test_calibration_of_a_linear_time():
     assert calibration.samples_in(times, 0.5) == 48
     assert calibration.predict(times, 64) == pytest.approx(0.66)
     assert list(calibration.ladder(seconds, budget=0.5, largest=4)) == [1, 4]
+    assert list(calibration.ladder(seconds, budget=0.02)) == [1, 4]
     assert list(calibration.ladder(seconds, budget=0.001)) == [1]
     assert calibration.samples_in({1: 0.1}, 0.05) == 1
 

@@ -16,6 +16,9 @@ PATIENCE = 20.0
 #: Renders of more samples than this are long enough to be measured once.
 FEW_SAMPLES = 4
 
+#: The render time of the second number of samples, in budgets, up to which it is measured.
+SECOND = 4.0
+
 #: An equal-time rendering is made if one sample takes at most so many times the time.
 TOLERANCE = 1.5
 
@@ -32,7 +35,8 @@ def steady_seconds(measure: Measure, spp: int) -> float:
 def ladder(measure: Measure, budget: float, largest: int | None = None) -> dict[int, float]:
     """Measure 1, 4, 16, ... samples as long as a render takes at most ``budget`` seconds.
 
-    One sample is always measured.
+    One sample is always measured, and four if they take at most ``SECOND`` budgets: one number
+    of samples says nothing about how the error falls.
 
     Args:
         measure: renders once.
@@ -45,13 +49,14 @@ def ladder(measure: Measure, budget: float, largest: int | None = None) -> dict[
     times = {1: steady_seconds(measure, 1)}
     for power in itertools.count(1):
         spp = 4**power
+        limit = budget * (SECOND if power == 1 else 1.0)
         too_many = largest is not None and spp > largest
-        if too_many or _lower_bound(times, spp) > budget:
+        if too_many or _lower_bound(times, spp) > limit:
             return times
         seconds = steady_seconds(measure, spp)
-        if seconds > budget:
+        if seconds > limit:
             seconds = min(seconds, measure(spp))
-        if seconds > budget:
+        if seconds > limit:
             return times
         times[spp] = seconds
 

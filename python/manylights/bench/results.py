@@ -43,7 +43,8 @@ class Results:
 
     def save(self) -> None:
         """Write ``results.json``, whole or not at all."""
-        text = json.dumps(self.data, indent=1, allow_nan=False)
+        scenes = [_without_empty_points(entry) for entry in self.data["scenes"]]
+        text = json.dumps({**self.data, "scenes": scenes}, indent=1, allow_nan=False)
         with self.writing:
             partial = self.folder / f".{NAME}.{os.getpid()}.partial"
             partial.write_text(text)
@@ -158,6 +159,15 @@ def unskip(entry: dict[str, Any], method: Method) -> None:
 def is_skipped(entry: dict[str, Any], method: Method) -> bool:
     """Is it noted why this method is not measured?"""
     return any(item["spec"] == method.spec for item in entry["skipped"])
+
+
+def _without_empty_points(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return a scene's entry without numbers of samples that are planned and not yet rendered."""
+    series = [
+        {**item, "points": [point for point in item["points"] if point["seed"]]}
+        for item in entry["series"]
+    ]
+    return {**entry, "series": series}
 
 
 def _fresh(variant: str) -> dict[str, Any]:

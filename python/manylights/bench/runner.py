@@ -267,8 +267,8 @@ class SceneRun:
 
     def _largest(self) -> int | None:
         """Return the largest number of samples that the reference is good for, None if any."""
-        spp = (self.entry["reference"] or {}).get("spp")
-        return None if spp is None else spp // reference.PASSES
+        spp = (self.entry["reference"] or {}).get("spp", 0)
+        return spp // reference.PASSES or None
 
     def _check_samples(self, wanted: list[int]) -> None:
         largest = self._largest()
