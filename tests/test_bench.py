@@ -14,7 +14,15 @@ import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights.bench import calibration, methods, results, scene_source, standard
+from manylights.bench import (
+    calibration,
+    drawing,
+    methods,
+    results,
+    runner,
+    scene_source,
+    standard,
+)
 from manylights.bench.methods import Kind, Method
 from manylights.bench.moments import Moments
 from manylights.bench.workload import Workload
@@ -283,13 +291,27 @@ def test_private_scenes_are_marked(tmp_path):
     assert [scene["private"] for scene in data["scenes"]] == [False, True]
 
 
-def test_time_of_ours_has_no_build_after_power_sampling(tmp_path, scalar_variant):
-    """With an environment Mitsuba makes emitters look changed: the tree is built off the clock."""
-    path = tmp_path / "sky.xml"
-    shutil.copy(SCENES / "constant.xml", path)
-    status, data = bench(tmp_path / "out", path, *FEW, "-D", "resx=16", "-D", "resy=9")
+def test_no_tree_is_built_on_the_clock_after_power_sampling(tmp_path, llvm, monkeypatch):
+    """With an environment each change of the weights makes the emitters look new to the tree."""
+    built = []
+
+    def watched(loaded, integrator, spp, seed):
+        ours = "build_ms" in mi.traverse(integrator)
+        before = build_time(integrator) if ours else 0.0
+        result = drawing.draw(loaded, integrator, spp, seed)
+        if ours and seed <= 2:
+            built.append(build_time(integrator) != before)
+        return result
+
+    def build_time(integrator):
+        return np.ravel(mi.traverse(integrator)["build_ms"])[0]
+
+    monkeypatch.setattr(runner, "draw", watched)
+    size = ("-D", "resx=16", "-D", "resy=9")
+    status, data = bench(tmp_path, SCENES / "constant.xml", *FEW, "--variant", llvm, *size)
     assert status == 0
     assert set(series_by_spec(data["scenes"][0])) == {"power", "resampled_tree"}
+    assert built == [False] * 4
 
 
 def assert_fails(capsys, arguments, *words):
@@ -498,14 +520,22 @@ def test_samplers_become_independent(tmp_path, scalar_variant):
 
 
 def test_scenes_of_one_name_get_numbers(tmp_path, scalar_variant):
+    sources = []
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
-        shutil.copy(SCENES / "points.xml", tmp_path / folder / "scene.xml")
+        shutil.copy(SCENES / "points.xml", tmp_path / folder / "points.xml")
+        sources.append(scene_source.find(str(tmp_path / folder / "points.xml")))
     found = results.open_folder(str(tmp_path / "out"), "scalar_rgb")
-    sources = [scene_source.find(str(tmp_path / name / "scene.xml")) for name in ("a", "b")]
     names = [found.scene(source, name=source.name)["name"] for source in sources]
-    assert names == ["scene", "scene_2"]
-    assert found.scene(sources[1], name="scene") is found.data["scenes"][1]
+    assert names == ["points", "points_2"]
+    assert found.scene(sources[1], name="points") is found.data["scenes"][1]
+
+
+def test_files_called_scene_have_the_name_of_their_folder(tmp_path, scalar_variant):
+    (tmp_path / "kitchen").mkdir()
+    shutil.copy(SCENES / "points.xml", tmp_path / "kitchen" / "scene.xml")
+    source = scene_source.find(str(tmp_path / "kitchen" / "scene.xml"))
+    assert (source.name, source.text) == ("kitchen", "kitchen/scene.xml")
 
 
 @pytest.mark.parametrize("jobs", [standard.standard, standard.quick])
@@ -575,8 +605,6 @@ def test_importing_the_package_imports_no_extra():
 
 
 def test_a_method_with_broken_pixels_is_left_out(tmp_path, monkeypatch):
-    from manylights.bench import drawing
-
     render = drawing._render
 
     def spoilt(loaded, integrator, spp, seed):

@@ -105,7 +105,8 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
-    text = "/".join(Path(path).resolve().parts[-2:])
+    folder, file_name = Path(path).resolve().parts[-2:]
+    text = f"{folder}/{file_name}"
     digest = hashlib.sha256(json.dumps(defines, sort_keys=True).encode())
     for file in _files_of(path, state):
         digest.update(file.read_bytes())
@@ -116,8 +117,9 @@ def _file(path: str, defines: dict[str, str]) -> Source:
         except RuntimeError as error:
             raise UsageError(f"{path}: {one_line(error)}") from error
 
-    stem = _plain(Path(path).stem)
-    return Source(text, stem, stem, digest.hexdigest(), load)
+    stem = Path(path).stem
+    name = _plain(folder if stem == "scene" else stem)
+    return Source(text, name, name, digest.hexdigest(), load)
 
 
 def _files_of(path: str, state) -> list[Path]:
