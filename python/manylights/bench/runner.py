@@ -37,6 +37,10 @@ FLIP_SEEDS = 2
 CALIBRATION_SEED = 2**30
 EQUAL_TIME_SEED = CALIBRATION_SEED + 1
 
+#: Renders that look for the number of samples that takes a given time, and the logarithm of the
+#: ratio of times that is near enough: 15 %.
+EQUAL_TIME_TRIES, EQUAL_TIME_DISTANCE = 4, 0.14
+
 #: Samples of the render that counts the work of our methods.
 MAP_SAMPLES = 4
 
@@ -385,11 +389,7 @@ class SceneRun:
         if max(candidate.times) > 1:
             # Compiles the kernel for numbers that are no powers of two
             self._draw(candidate, 3, CALIBRATION_SEED)
-        times = candidate.times
-        for _ in range(2):
-            spp = calibration.samples_in(times, target)
-            drawing = self._draw(candidate, spp, EQUAL_TIME_SEED)
-            times = {1: times[1], spp: drawing.seconds} if spp > 1 else times
+        spp, drawing = self._fill_time(candidate, target)
         errors = metrics.relative_errors(drawing.image, self.reference)
         series["equal_time"] = {
             "spp": spp,
@@ -401,6 +401,20 @@ class SceneRun:
         self.found.write_image(self.entry["name"], candidate.method.key, drawing.image, RGB)
         self.found.save()
         self.work.finish(self.job.source.text, 3.0 * target)
+
+    def _fill_time(self, candidate: Candidate, target: float) -> tuple[int, Drawing]:
+        """Render until a number of samples takes about ``target`` seconds; return the best."""
+        times, tries = candidate.times, []
+        for _ in range(EQUAL_TIME_TRIES):
+            spp = calibration.samples_in(times, target)
+            drawing = self._draw(candidate, spp, EQUAL_TIME_SEED)
+            distance = abs(np.log(drawing.seconds / target))
+            tries.append((distance, spp, drawing))
+            if distance < EQUAL_TIME_DISTANCE or spp == 1:
+                break
+            times = {1: min(times[1], drawing.seconds), spp: drawing.seconds}
+        _, spp, drawing = min(tries, key=lambda item: item[0])
+        return spp, drawing
 
     def _draw_maps(self, candidate: Candidate) -> None:
         """Write how much work our methods do at each pixel."""
