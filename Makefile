@@ -41,6 +41,15 @@ test: $(INSTALLED)  ## Run the quick tests
 test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
+# Without HOME nothing is taken from Dr.Jit's cache on disk: first renders compile.
+.PHONY: bench
+bench: $(INSTALLED)  ## Measure all methods on the standard scenes (an hour) into bench/
+	env -u HOME $(BIN)/manylights bench --standard --out bench $(ARGS)
+
+.PHONY: bench-quick
+bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
+	env -u HOME $(BIN)/manylights bench --quick --out bench-quick $(ARGS)
+
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling
 	$(BIN)/ruff check python tests
@@ -55,7 +64,7 @@ format: $(VENV)/.dev-tools  ## Rewrite the sources in the style that lint checks
 
 .PHONY: clean
 clean:  ## Delete everything that was built, .venv too
-	rm -rf build dist $(VENV) .pytest_cache .ruff_cache .hypothesis demo.exr demo.png
+	rm -rf build dist $(VENV) .pytest_cache .ruff_cache .hypothesis demo.exr demo.png bench bench-quick
 	find python tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip 25.1 is the first that can install the dependency groups of pyproject.toml.
@@ -83,5 +92,5 @@ $(VENV)/.build-tools: pyproject.toml | $(VENV)/.created
 # Without build isolation the paths of the headers stay the same, and with them the objects.
 $(INSTALLED): $(VENV)/.build-tools $(SOURCES)
 	@echo "Compiling the plugins. The first time takes some minutes."
-	$(PIP) install --quiet --no-build-isolation -C build-dir=$(BUILD_DIR) '.[test]'
+	$(PIP) install --quiet --no-build-isolation -C build-dir=$(BUILD_DIR) '.[test,bench]'
 	@rm -f $(VENV)/.installed-* && touch $@

@@ -13,7 +13,8 @@ The order of ``import manylights`` and ``mi.set_variant`` does not matter: Mitsu
 path for the whole process and reads it whenever a scene asks for a plugin.
 
 ``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.scenes`` generates
-scenes.
+scenes; ``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose emitters by
+power, for comparisons.
 """
 
 from __future__ import annotations
@@ -22,7 +23,16 @@ from manylights._plugins import REQUIRED_MITSUBA, plugin_dir, register
 
 register()
 
-from manylights import scenes  # noqa: E402  (needs the right Mitsuba, which register() checks)
+# These need the right Mitsuba, which register() checks.
+from manylights import scenes  # noqa: E402
+from manylights.power import power_sampling, power_weights  # noqa: E402
 
 __version__ = "0.1.0"
-__all__ = ["REQUIRED_MITSUBA", "__version__", "plugin_dir", "scenes"]
+__all__ = [
+    "REQUIRED_MITSUBA",
+    "__version__",
+    "plugin_dir",
+    "power_sampling",
+    "power_weights",
+    "scenes",
+]

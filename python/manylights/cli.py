@@ -9,6 +9,7 @@ import sys
 import time
 
 from manylights.errors import one_line
+from manylights.progress import say
 
 #: Exit status of a command that could not do what was asked.
 FAILURE = 2
@@ -35,12 +36,14 @@ Generates a city at night with thousands of lights, renders it, and says how lon
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return the exit status: 0, 2 for errors, 130 after Ctrl-C.
 
+    ``compare`` returns 1, too, for images that differ.
+
     Args:
         arguments: what follows the command's name. Default: what the process was started with.
     """
     options = _parser().parse_args(arguments)
     try:
-        options.command(options)
+        return options.command(options) or 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -52,11 +55,11 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"manylights: {one_line(error)}", file=sys.stderr)
         return FAILURE
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     from manylights import __version__
+    from manylights.bench.cli import add_bench, add_compare
 
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -73,6 +76,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_render(commands, common)
     _add_tree(commands, common)
     _add_demo(commands, common)
+    add_bench(commands, common)
+    add_compare(commands, common)
     return parser
 
 
@@ -185,10 +190,6 @@ def _seed(text: str) -> int:
     return value
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
 def _start(options) -> str:
     """Set the variant asked for, say which it is and why, and return it."""
     from manylights import loading
@@ -198,7 +199,7 @@ def _start(options) -> str:
         reason = "as asked for"
     else:
         reason = "libLLVM found" if variant == "llvm_ad_rgb" else "no usable libLLVM found"
-    _say(f"variant: {variant} ({reason})")
+    say(f"variant: {variant} ({reason})")
     return variant
 
 
@@ -218,7 +219,7 @@ def _render(options) -> None:
     _start(options)
     loaded = loading.load(options.scene, defines, options.integrator, settings)
     for note in loaded.notes:
-        _say(note)
+        say(note)
     _render_to(loaded, target, options, options.spp, options.sensor)
 
 
@@ -235,9 +236,9 @@ def _render_to(loaded, target, options, spp: int, sensor: int = 0) -> float:
     seconds = time.perf_counter() - start
     written, notes = images.write_images(bitmap, target)
     for note in notes:
-        _say(note)
+        say(note)
     names = " and ".join(str(path) for path in written)
-    _say(f"rendered in {seconds:.1f} s, wrote {names}")
+    say(f"rendered in {seconds:.1f} s, wrote {names}")
     return seconds
 
 
@@ -268,7 +269,7 @@ def _demo(options) -> None:
     )
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
     lights = sum(tree.count_kinds(loaded.scene).values())
-    _say(f"lights: {lights:,}")
+    say(f"lights: {lights:,}")
     seconds = _render_to(loaded, target, options, spp)
     print(f"{lights:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")
 

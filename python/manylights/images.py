@@ -36,13 +36,13 @@ def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
     Returns:
         The written files, and lines for the log about what could not be written.
     """
-    written, notes = [_write(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)], []
+    written, notes = [write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)], []
     preview = _preview(bitmap)
     if preview is None:
         notes.append("preview: the film has no colour channels, no PNG written")
     else:
         file_format = mi.Bitmap.FileFormat.PNG
-        written.append(_write(preview, target.with_suffix(".png"), file_format))
+        written.append(write_whole(preview, target.with_suffix(".png"), file_format))
     return written, notes
 
 
@@ -56,7 +56,8 @@ def _preview(bitmap):
     return bitmap.convert(formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
 
 
-def _write(bitmap, target: Path, file_format) -> Path:
+def write_whole(bitmap, target: Path, file_format) -> Path:
+    """Write ``bitmap`` to ``target``, under another name first, and return ``target``."""
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         with threads_for_files():

@@ -61,12 +61,28 @@ def format_seconds(seconds: float | None) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def run_with_bar(title: str, work: Callable[[Callable[[float], None]], Any]) -> Any:
+def say(text: str) -> None:
+    """Print a line on stderr, above the progress bar if there is one."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def run_with_bar(
+    title: str,
+    work: Callable[[Callable[[float], None]], Any],
+    writing: threading.RLock | None = None,
+    farewell: str = "interrupted, nothing written",
+) -> Any:
     """Run ``work(report)`` with a progress bar on stderr and return its result.
 
     The work runs in a thread of its own: a compiled renderer cannot be interrupted, but the thread
     that waits for it can. On Ctrl-C the process ends with status 130, without waiting for the work
     and so without anything that would come after it. Without a terminal there is no bar.
+
+    Args:
+        title: what the bar is labelled with.
+        work: is given the function that takes the finished fraction, from 0 to 1.
+        writing: held by the work while it writes a file: Ctrl-C waits for it. Default: no lock.
+        farewell: printed after Ctrl-C.
     """
     estimate = Estimate()
     outcome: dict[str, Any] = {}
@@ -82,7 +98,7 @@ def run_with_bar(title: str, work: Callable[[Callable[[float], None]], Any]) -> 
     try:
         _show(title, estimate, worker)
     except KeyboardInterrupt:
-        _end_interrupted()
+        _end_interrupted(writing, farewell)
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]
@@ -105,6 +121,8 @@ def _show(title: str, estimate: Estimate, worker: threading.Thread) -> None:
         bar.update(task, completed=1.0, left=format_seconds(0.0))
 
 
-def _end_interrupted() -> None:
-    print("interrupted, nothing written", file=sys.stderr, flush=True)
+def _end_interrupted(writing: threading.RLock | None, farewell: str) -> None:
+    if writing is not None:
+        writing.acquire()
+    say(farewell)
     os._exit(INTERRUPTED)

@@ -152,6 +152,50 @@ def twelve_decades(
     return _stage(lights, width, height, spp, **options)
 
 
+def cut_boundary(
+    n_lights: int = 300,
+    *,
+    seed: int = 0,
+    width: int = 160,
+    height: int = 90,
+    spp: int = 16,
+    integrator="manylights_direct",
+) -> dict:
+    """A floor under three clusters of points in a row, where neighbouring pixels see other trees.
+
+    A traversal that splits clusters by a rule, without random numbers, considers other lights on
+    one side of a line than on the other, and the noise changes there at once. The picture shows a
+    strip of the floor from above, 16 m long and so narrow that nothing changes along the columns
+    but the noise: the standard deviation along a column shows such lines as steps.
+
+    Args:
+        n_lights: number of point lights, 1 to 1,000,000; the total intensity is 30 W sr^-1.
+        seed: of the random numbers.
+        width, height: of the image in pixels.
+        spp: samples per pixel.
+        integrator: name of a plugin, or its dictionary.
+    """
+    n_lights = build.check_count(n_lights)
+    rng = np.random.default_rng(seed)
+    cluster = np.arange(n_lights) % 3
+    position = rng.uniform([-0.8, -0.8, 0.8], [0.8, 0.8, 1.6], (n_lights, 3))
+    position[:, 0] += np.array([-5.0, 0.0, 5.0])[cluster]
+    weight = build.log_uniform(rng, n_lights, 1.0, 1.0)
+    colors = np.array([build.WARM, build.WHITE, build.COOL])[cluster]
+    intensity = (30.0 * weight / weight.sum())[:, None] * colors
+    lights = [build.point(*item) for item in zip(position, intensity)]
+    to_world = build.mi.ScalarTransform4f().look_at(
+        origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]
+    )
+    sensor = build.camera([0, 0, 4], [0, 0, 0], width=width, height=height, spp=spp, up=(0, 1, 0))
+    del sensor["fov"]
+    # The height scales, too: half a millimetre of floor from the first row to the last.
+    narrow = build.mi.ScalarTransform4f().scale([8.0, 2.5e-4 * width / height, 1.0])
+    sensor.update(type="orthographic", to_world=to_world @ narrow)
+    floor = build.rectangle([-15, -15, 0], [30, 0, 0], [0, 30, 0], bsdf=build.diffuse(0.5))
+    return build.scene(integrator, sensor, {"floor": floor, **build.numbered("light", lights)})
+
+
 def _stage(
     lights: list, width: int, height: int, spp: int, *, integrator="manylights_direct", extra=None
 ) -> dict:

@@ -161,6 +161,7 @@ def glossy(
     height: int = 144,
     spp: int = 16,
     integrator="manylights_direct",
+    texture: bool = False,
 ) -> dict:
     """Rough metal spheres and a rough metal floor under a canopy of small lamps.
 
@@ -171,6 +172,8 @@ def glossy(
         width, height: of the image in pixels.
         spp: samples per pixel.
         integrator: name of a plugin, or its dictionary.
+        texture: store the radiance in a texture instead of a face attribute: Mitsuba's own emitter
+            sampling handles that one only. Default: False.
     """
     n_lights = build.check_count(n_lights)
     if not 0.0 < roughness <= 1.0:
@@ -197,7 +200,7 @@ def glossy(
     parts = {
         "floor": _ground(14.0, _metal("Al", roughness)),
         **build.numbered("sphere", spheres),
-        "lights": build.glowing_mesh(lamps, n_lights),
+        "lights": build.glowing_mesh(lamps, n_lights, texture=texture),
     }
     sensor = build.camera(
         [0.0, -13.0, 3.4], [0.0, 0.0, 1.2], width=width, height=height, spp=spp, fov=55.0

@@ -1,0 +1,82 @@
+"""One render: the picture as an array, and what it took."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from manylights import rendering
+from manylights.bench.scene_source import LoadedScene
+from manylights.errors import UsageError
+
+#: Channels of a pixel that are colours, by the number of channels: with or without alpha.
+COLORS = {1: 1, 2: 1, 3: 3, 4: 3}
+
+
+class BrokenImage(Exception):
+    """A render gave pixels that are no numbers."""
+
+
+@dataclass
+class Drawing:
+    """A picture, shape (height, width, 3), and the seconds of clock and of all CPUs together."""
+
+    image: np.ndarray
+    seconds: float
+    cpu_seconds: float
+
+
+def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
+    """Render a scene and measure how long that takes, until the pixels are in memory.
+
+    Args:
+        loaded: the scene.
+        integrator: what ``mi.load_dict`` returned.
+        spp: samples per pixel, at least 1.
+        seed: of the random numbers.
+
+    Raises:
+        BrokenImage: a pixel is infinite or not a number.
+        UsageError: the film has no colours.
+    """
+    start, cpu_start = time.perf_counter(), time.process_time()
+    pixels = _render(loaded, integrator, spp, seed)
+    seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
+    image = _colors(pixels)
+    broken = int(np.sum(~np.isfinite(image).all(axis=2)))
+    if broken:
+        raise BrokenImage(f"{broken} pixels are not finite at {spp} spp with seed {seed}")
+    return Drawing(image, seconds, cpu_seconds)
+
+
+def draw_channels(loaded: LoadedScene, integrator, spp: int, seed: int, count: int) -> np.ndarray:
+    """Render a scene and return the last ``count`` channels, those the integrator adds."""
+    pixels = np.array(integrator.render(loaded.scene, sensor=0, seed=seed, spp=spp))
+    return pixels[..., -count:]
+
+
+def _render(loaded: LoadedScene, integrator, spp: int, seed: int) -> np.ndarray:
+    """Render in as many passes as the memory needs; each sample has the same weight."""
+    width, height = loaded.size
+    sizes = [spp]
+    if (
+        not mi.variant().startswith("scalar")
+        and spp * width * height > rendering.MAX_SAMPLES_PER_PASS
+    ):
+        sizes = rendering.pass_sizes(spp, width * height)
+    total = 0.0
+    for index, size in enumerate(sizes):
+        seed_of_pass = rendering.pass_seed(seed, index)
+        pixels = integrator.render(loaded.scene, sensor=0, seed=seed_of_pass, spp=size)
+        total = total + np.array(pixels) * (size / spp)
+    return total
+
+
+def _colors(pixels: np.ndarray) -> np.ndarray:
+    colors = COLORS.get(pixels.shape[2])
+    if colors is None:
+        raise UsageError(f"the film has {pixels.shape[2]} channels, not luminance or RGB")
+    return np.broadcast_to(pixels[..., :colors], (*pixels.shape[:2], 3)).astype(np.float32)

@@ -1,0 +1,79 @@
+"""Errors of images, arrays of shape (height, width, channels), against a reference."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from manylights.bench import extras
+
+#: Added to a reference pixel, as a share of the reference's mean: where the reference is dark, an
+#: error counts in relation to this, not to almost nothing.
+EPSILON = 0.05
+
+#: The share of pixels with the largest errors that a trimmed error leaves out: the mean of squares
+#: hangs on very few pixels in scenes where single samples are bright.
+TRIM = 0.001
+
+
+def squared_scale(reference: np.ndarray) -> np.ndarray:
+    """Return what squared differences of each pixel are divided by, shape (height, width)."""
+    reference = np.asarray(reference, dtype=float)
+    return reference.mean(axis=2) ** 2 + (EPSILON * reference.mean()) ** 2
+
+
+def relative_errors(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Return the relative squared error of each pixel, shape (height, width).
+
+    It is the mean over the channels of (x - r)^2 / (r_bar^2 + (epsilon mean r)^2), where r_bar is
+    the mean over the pixel's channels. Where both are zero in an all black reference it is zero.
+    """
+    difference = np.asarray(image, dtype=float) - np.asarray(reference, dtype=float)
+    return _divide(np.mean(difference**2, axis=2), squared_scale(reference))
+
+
+def trimmed_mean(errors: np.ndarray, trim: float = TRIM) -> float:
+    """Return the mean without the largest values, the share ``trim`` of all, rounded up."""
+    ordered = np.sort(np.ravel(errors))
+    kept = ordered.size - int(np.ceil(trim * ordered.size))
+    return float(ordered[:kept].mean()) if kept else float(ordered.mean())
+
+
+def relative_mse(image: np.ndarray, reference: np.ndarray, trim: float = 0.0) -> float:
+    """Return the relative mean squared error, without the worst share ``trim`` of the pixels."""
+    return trimmed_mean(relative_errors(image, reference), trim)
+
+
+def rmse(image: np.ndarray, reference: np.ndarray) -> float:
+    """Return the root of the mean squared difference."""
+    difference = np.asarray(image, dtype=float) - np.asarray(reference, dtype=float)
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+def variance_error(variance: np.ndarray, reference: np.ndarray) -> float:
+    """Return the relative mean squared error that an image of this variance is expected to have.
+
+    Args:
+        variance: of each pixel and channel.
+        reference: estimate of the expected image.
+    """
+    return float(_divide(np.mean(variance, axis=2), squared_scale(reference)).mean())
+
+
+def flip_error(image: np.ndarray, reference: np.ndarray) -> float:
+    """Return the mean of HDR-FLIP, from 0 for equal images to 1.
+
+    It is a model of the difference that a person sees who flips between the two (Andersson et al.
+    2021), seen at 67 pixels per degree and at several exposures.
+
+    Raises:
+        UsageError: the package flip-evaluator is not installed.
+    """
+    flip = extras.require("flip_evaluator", "flip-evaluator")
+    pair = [np.ascontiguousarray(array, dtype=np.float32) for array in (reference, image)]
+    _, mean, _ = flip.evaluate(*pair, "HDR", applyMagma=False)
+    return float(mean)
+
+
+def _divide(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    zero = np.where(numerator > 0.0, np.inf, 0.0)
+    return np.divide(numerator, denominator, out=zero, where=denominator > 0.0)

@@ -1,0 +1,250 @@
+"""The file ``results.json`` of a measurement: read, checked, and written whole after each step."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import threading
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from manylights import images
+from manylights.bench import metrics
+from manylights.bench.methods import Method
+from manylights.bench.scene_source import Source
+from manylights.errors import UsageError, one_line
+from manylights.threads import threads_for_files
+
+FORMAT, NAME = 1, "results.json"
+
+#: What must be the same for results to be continued: times of two machines do not compare, and
+#: other versions may compute something else.
+SAME_VERSIONS = ("manylights", "mitsuba", "drjit")
+SAME_MACHINE = ("processor", "threads")
+
+
+class Results:
+    """The results in a folder.
+
+    Attributes:
+        folder: where they are.
+        data: the content of ``results.json``.
+        writing: held while a file is written; who ends the process takes it first.
+    """
+
+    def __init__(self, folder: Path, data: dict[str, Any]) -> None:
+        self.folder, self.data, self.writing = folder, data, threading.RLock()
+
+    def save(self) -> None:
+        """Write ``results.json``, whole or not at all."""
+        scenes = [_without_empty_points(entry) for entry in self.data["scenes"]]
+        text = json.dumps({**self.data, "scenes": scenes}, indent=1, allow_nan=False)
+        with self.writing:
+            partial = self.folder / f".{NAME}.{os.getpid()}.partial"
+            partial.write_text(text)
+            os.replace(partial, self.folder / NAME)
+
+    def write_image(self, scene: str, name: str, pixels: np.ndarray, channels: list[str]) -> None:
+        """Write ``SCENE/NAME.exr``, whole or not at all, in single precision."""
+        target = self.folder / scene / f"{name}.exr"
+        size = [pixels.shape[1], pixels.shape[0]]
+        formats, kind = mi.Bitmap.PixelFormat, mi.Struct.Type.Float32
+        # Made of an array, a bitmap calls its channels Y and A or R, G and B.
+        bitmap = mi.Bitmap(formats.MultiChannel, kind, size, len(channels), channels)
+        np.array(bitmap, copy=False)[:] = pixels
+        with self.writing:
+            images.write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)
+
+    def read_reference(self, scene: str) -> np.ndarray:
+        """Return the reference of a scene, shape (height, width, 3)."""
+        with threads_for_files():
+            return np.array(mi.Bitmap(str(self.folder / scene / "reference.exr")))
+
+    def has_image(self, scene: str, name: str) -> bool:
+        """Is there ``SCENE/NAME.exr``?"""
+        return (self.folder / scene / f"{name}.exr").is_file()
+
+    def find(self, source: Source) -> dict[str, Any] | None:
+        """Return the entry of a scene, None if there is none or the scene has changed."""
+        wanted = (source.text, source.fingerprint)
+        scenes = self.data["scenes"]
+        return next((e for e in scenes if (e["source"], e["hash"]) == wanted), None)
+
+    def scene(self, source: Source, **facts: Any) -> dict[str, Any]:
+        """Return the entry of a scene: that of an earlier run if the scene is the same.
+
+        A scene whose content has changed starts anew. Another one of the same name gets a number.
+
+        Args:
+            source: the scene.
+            facts: values for keys of the entry, of which ``name`` is what to call it.
+        """
+        scenes = self.data["scenes"]
+        for index, entry in enumerate(scenes):
+            if entry["source"] != source.text:
+                continue
+            if entry["hash"] != source.fingerprint:
+                scenes[index] = self._entry(source, {**facts, "name": entry["name"]})
+            return scenes[index]
+        taken = {entry["name"] for entry in scenes}
+        name, number = facts["name"], 2
+        while name in taken:
+            name, number = f"{facts['name']}_{number}", number + 1
+        scenes.append(self._entry(source, {**facts, "name": name}))
+        return scenes[-1]
+
+    def _entry(self, source: Source, facts: dict[str, Any]) -> dict[str, Any]:
+        folder = self.folder / facts["name"]
+        folder.mkdir(exist_ok=True)
+        # Of a scene that was of this name and has changed.
+        for path in (*folder.glob("*.exr"), *folder.glob("*.npz")):
+            path.unlink()
+        origin = {"source": source.text, "hash": source.fingerprint}
+        return {**facts, **origin, "reference": None, "series": [], "skipped": []}
+
+
+def open_folder(folder: str, variant: str) -> Results:
+    """Return the results in a folder, or empty ones in a new folder.
+
+    Args:
+        folder: made if there is none.
+        variant: of Mitsuba.
+
+    Raises:
+        UsageError: the folder cannot be written, or its results are of another variant, machine or
+            version, or no results of ours.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"--out {folder}: not a folder that can be made ({error.strerror})"
+        ) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise UsageError(f"--out {folder}: not writable")
+    fresh = _fresh(variant)
+    if not (path / NAME).exists():
+        return Results(path, fresh)
+    data = _read(path / NAME)
+    for what, old, new in _differences(data, fresh):
+        raise UsageError(
+            f"--out {folder}: has results with {what} {old}, this is {new}; choose another folder"
+        )
+    return Results(path, data)
+
+
+def series_of(entry: dict[str, Any], method: Method) -> dict[str, Any] | None:
+    """Return the measurements of a method in a scene's entry, None if there are none."""
+    return next((series for series in entry["series"] if series["spec"] == method.spec), None)
+
+
+def skip(entry: dict[str, Any], method: Method, why: str) -> None:
+    """Note in a scene's entry why a method is not measured."""
+    unskip(entry, method)
+    entry["skipped"].append({"spec": method.spec, "why": why})
+
+
+def unskip(entry: dict[str, Any], method: Method) -> None:
+    """Forget in a scene's entry that a method is not measured."""
+    entry["skipped"] = [item for item in entry["skipped"] if item["spec"] != method.spec]
+
+
+def is_skipped(entry: dict[str, Any], method: Method) -> bool:
+    """Is it noted why this method is not measured?"""
+    return any(item["spec"] == method.spec for item in entry["skipped"])
+
+
+def _without_empty_points(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return a scene's entry without numbers of samples that are planned and not yet rendered."""
+    series = [
+        {**item, "points": [point for point in item["points"] if point["seed"]]}
+        for item in entry["series"]
+    ]
+    return {**entry, "series": series}
+
+
+def _fresh(variant: str) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "versions": _versions(),
+        "machine": _machine(),
+        "variant": variant,
+        "metric": {"epsilon": metrics.EPSILON, "trim": metrics.TRIM},
+        "scenes": [],
+    }
+
+
+def _versions() -> dict[str, str]:
+    from manylights import __version__
+
+    return {
+        "manylights": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+    }
+
+
+def _machine() -> dict[str, Any]:
+    text = _text_of("/proc/cpuinfo")
+    names = [line.partition(":")[2].strip() for line in text.splitlines() if "model name" in line]
+    return {
+        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "cores": _cores(text),
+        "threads": dr.thread_count(),
+        "memory_gib": _memory_gib(),
+        "system": platform.platform(),
+    }
+
+
+def _cores(cpuinfo: str) -> int:
+    """Return the number of cores, of processors where the system does not say."""
+    chips = [line for line in cpuinfo.splitlines() if line.startswith(("physical id", "core id"))]
+    pairs = set(zip(chips[::2], chips[1::2]))
+    return len(pairs) or os.cpu_count() or 1
+
+
+def _memory_gib() -> float | None:
+    try:
+        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return round(size / 2**30, 1)
+
+
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).read_text()
+    except OSError:
+        return ""
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text())
+        usable = data["format"] == FORMAT and isinstance(data["scenes"], list)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: not results of manylights bench ({one_line(error)})") from error
+    if not usable:
+        raise UsageError(
+            f"{path}: results of format {data['format']}, can go on with {FORMAT} only"
+        )
+    return data
+
+
+def _differences(data: dict[str, Any], fresh: dict[str, Any]):
+    """Yield (what, old, new) for all that forbids to go on with old results."""
+    pairs = [("variant", data.get("variant"), fresh["variant"])]
+    for group, names in (("versions", SAME_VERSIONS), ("machine", SAME_MACHINE)):
+        for name in names:
+            pairs.append((name, data.get(group, {}).get(name), fresh[group][name]))
+    return [pair for pair in pairs if pair[1] != pair[2]]

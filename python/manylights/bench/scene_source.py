@@ -1,0 +1,236 @@
+"""What SCENE may be on the command line: an XML file, or a generator of ``manylights.scenes``.
+
+A generator is written ``NAME[:LIGHTS][,KEY=VALUE]...``, as in ``city:1000,kind=points``. The keys
+are the arguments of the generator, and ``integrator``, ``max_depth``, ``rr_depth`` and
+``hide_emitters``. Pictures have 160 x 90 pixels unless ``width`` and ``height`` say otherwise;
+emission is stored in a texture where a generator offers it, since Mitsuba's own sampling finds no
+light otherwise.
+
+All samplers become ``independent``: stratified ones round numbers of samples to their taste, and
+errors would not fall in proportion to the samples.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from manylights import integrators, loading, scenes, tree
+from manylights.bench import methods
+from manylights.errors import UsageError, one_line
+from manylights.threads import threads_for_files
+
+WIDTH, HEIGHT = 160, 90
+
+#: Keys of a generated scene that belong to its integrator.
+INTEGRATOR_KEYS = ("max_depth", "rr_depth", "hide_emitters")
+
+#: Generators that can store emission in a texture.
+TEXTURED = ("city", "fog_open", "fog_rooms", "fog_street", "glossy", "rooms")
+
+
+@dataclass
+class LoadedScene:
+    """A scene in memory and what is to be known about it.
+
+    Attributes:
+        scene: Mitsuba's.
+        kind: what its integrator computes.
+        lights: number of lights, triangles of emissive meshes counted one by one.
+        media: does it have participating media?
+    """
+
+    scene: Any
+    kind: methods.Kind
+    lights: int
+    media: bool
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture, in pixels."""
+        width, height = self.scene.sensors()[0].film().crop_size()
+        return int(width), int(height)
+
+
+@dataclass
+class Source:
+    """Where a scene comes from.
+
+    Attributes:
+        text: for people, a file's name with its folder, or the generator's call.
+        name: short, without characters that are special in file names.
+        family: the same for scenes that differ in the number of lights only.
+        fingerprint: SHA-256 of all that the scene is made of.
+        load: makes the scene.
+    """
+
+    text: str
+    name: str
+    family: str
+    fingerprint: str
+    load: Callable[[], LoadedScene]
+
+
+def find(text: str, defines: dict[str, str] | None = None) -> Source:
+    """Find the scene that ``text`` names, and check what can be checked without loading it.
+
+    Args:
+        text: an XML file or a call of a generator.
+        defines: values for the ``<default>`` parameters of XML files. Default: none.
+
+    Raises:
+        UsageError: there is no such file or generator, or it does not accept its arguments.
+    """
+    if Path(text).suffix == ".xml" or Path(text).is_file():
+        return _file(text, defines or {})
+    if _parse_call(text)[0] not in scenes.names():
+        raise UsageError(
+            f"{text}: neither an XML file nor a generator, those are {', '.join(scenes.names())}"
+        )
+    return _generated(text)
+
+
+def _file(path: str, defines: dict[str, str]) -> Source:
+    try:
+        with loading.search_beside(path), threads_for_files():
+            _, state = loading.parse(path, defines)
+    except RuntimeError as error:
+        raise UsageError(f"{path}: {one_line(error)}") from error
+    # The folder tells scenes apart that are all called scene.xml.
+    folder, file_name = Path(path).resolve().parts[-2:]
+    text = f"{folder}/{file_name}"
+    digest = hashlib.sha256(json.dumps(defines, sort_keys=True).encode())
+    for file in _files_of(path, state):
+        digest.update(file.read_bytes())
+
+    def load() -> LoadedScene:
+        try:
+            return _load_file(path, defines)
+        except RuntimeError as error:
+            raise UsageError(f"{path}: {one_line(error)}") from error
+
+    stem = Path(path).stem
+    name = _plain(folder if stem == "scene" else stem)
+    return Source(text, name, name, digest.hexdigest(), load)
+
+
+def _files_of(path: str, state) -> list[Path]:
+    """Return the XML files of a parsed scene and the files that it refers to."""
+    folder = Path(path).resolve().parent
+    files = [Path(str(file)) for file in state.files]
+    for node in state.nodes:
+        for _, value in node.props.items():
+            if isinstance(value, str) and value and (folder / value).is_file():
+                files.append(folder / value)
+    return files
+
+
+def _load_file(path: str, defines: dict[str, str]) -> LoadedScene:
+    with loading.search_beside(path), threads_for_files():
+        config, state = loading.parse(path, defines)
+        plugin, parameters = "path", {}
+        for node in integrators.leaf_integrators(state):
+            plugin, parameters = node.props.plugin_name(), dict(node.props.items())
+        for node in state.nodes:
+            if node.type == mi.ObjectType.Sampler:
+                node.props = mi.Properties("independent")
+        media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
+        scene = loading.instantiate(config, state)
+    return _describe(path, scene, plugin, parameters, media)
+
+
+def _generated(text: str) -> Source:
+    name, arguments, settings = _parse_call(text)
+    # A small one of the same kind: names and values are checked before anything is measured.
+    lights = arguments.get("n_lights", 10)
+    _generate(
+        text, name, {**arguments, "n_lights": lights if lights > 1_000_000 else min(lights, 10)}
+    )
+    content = json.dumps([name, arguments, settings], sort_keys=True, default=str)
+    from manylights import __version__
+
+    fingerprint = hashlib.sha256(f"{__version__} {content}".encode()).hexdigest()
+    rest = [f"{key}={value}" for key, value in (*arguments.items(), *settings.items())]
+    rest = [item for item in rest if not item.startswith("n_lights=")]
+
+    def load() -> LoadedScene:
+        description = _generate(text, name, arguments)
+        chosen = dict(description["integrator"])
+        plugin = settings.get("integrator", chosen.pop("type"))
+        chosen.update({key: settings[key] for key in INTEGRATOR_KEYS if key in settings})
+        # Methods bring their own integrators.
+        description["integrator"] = {"type": "direct"}
+        media = "medium" in description["sensor"]
+        return _describe(text, mi.load_dict(description), plugin, chosen, media)
+
+    return Source(text, _plain(text), _plain("-".join([name, *rest])), fingerprint, load)
+
+
+def _parse_call(text: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Split a call into the generator's name, its arguments, and settings of the integrator."""
+    head, *items = text.split(",")
+    name, separator, lights = head.partition(":")
+    if separator and "=" in lights:
+        items, lights = [lights, *items], ""
+    arguments: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
+    if lights:
+        if not lights.isdigit():
+            raise UsageError(f"{text}: {lights!r} is not a number of lights")
+        arguments["n_lights"] = int(lights)
+    for item in items:
+        key, equals, value = item.partition("=")
+        if not equals or not key:
+            raise UsageError(f"{text}: write {item!r} as KEY=VALUE")
+        target = settings if key in ("integrator", *INTEGRATOR_KEYS) else arguments
+        target[key] = integrators.parse_value(value)
+    return name, arguments, settings
+
+
+def _generate(text: str, name: str, arguments: dict[str, Any]) -> dict:
+    generator = getattr(scenes, name)
+    defaults: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
+    if name in TEXTURED:
+        defaults["texture"] = True
+    if "n_lights" not in inspect.signature(generator).parameters:
+        arguments = {key: value for key, value in arguments.items() if key != "n_lights"}
+    try:
+        with _quiet():
+            return generator(**{**defaults, **arguments})
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{text}: {one_line(error)}") from error
+
+
+@contextmanager
+def _quiet():
+    """Keep Mitsuba from warning of textures brighter than 1, which are light here."""
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
+
+
+def _describe(
+    text: str, scene, plugin: str, parameters: dict[str, Any], media: bool
+) -> LoadedScene:
+    try:
+        kind = methods.kind_of(plugin, parameters, media)
+    except UsageError as error:
+        raise UsageError(f"{text}: {error}") from error
+    lights = sum(tree.count_kinds(scene).values())
+    return LoadedScene(scene, kind, lights, media)
+
+
+def _plain(text: str) -> str:
+    """Return the text with all but letters, digits, dots and underscores turned into hyphens."""
+    return "".join(letter if letter.isalnum() or letter in "._" else "-" for letter in text)

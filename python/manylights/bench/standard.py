@@ -1,0 +1,78 @@
+"""The scenes that ``manylights bench --standard`` and ``--quick`` measure."""
+
+from __future__ import annotations
+
+from manylights.bench import methods, scene_source
+from manylights.bench.methods import Method
+from manylights.bench.runner import Job
+
+#: Budgets of a render in seconds: --standard is to end within an hour on two cores, --quick within
+#: five minutes.
+STANDARD_BUDGET, QUICK_BUDGET = 0.5, 0.15
+
+#: Values of single parameters, around their defaults, that show what the parameters do.
+SPLITTING_RATES = (0, 0.5, 1, 2, 4)
+RESERVOIRS, SHADOW_RAYS = (4, 8, 16), (1, 2, 4, 8)
+
+SWEEPS = (
+    *(f"resampled_tree:splitting_rate={value}" for value in SPLITTING_RATES),
+    *(f"resampled_tree:reservoirs={value}" for value in RESERVOIRS),
+    *(f"resampled_tree:shadow_rays={value}" for value in SHADOW_RAYS),
+    *(f"talk:splitting_rate={value}" for value in SPLITTING_RATES),
+    *(f"talk:splitting_rate={value}:split_function=far" for value in SPLITTING_RATES),
+)
+
+
+def standard() -> list[Job]:
+    """Return the scenes of ``--standard``.
+
+    Meshes store their emission in a texture, on which Mitsuba chooses points by radiance: the best
+    it can do. ``glossy_10k`` and ``one_light`` are scenes in which choosing lights well gains
+    little or nothing.
+    """
+    path, fog = "integrator=path,max_depth=6", "max_depth=4"
+    return [
+        *(_city(lights) for lights in (10, 100)),
+        _city(1_000, SWEEPS),
+        *(_city(lights) for lights in (10_000, 100_000, 1_000_000)),
+        _job("city_points_1k", "City, 1,000 points", "city:1000,kind=points", SWEEPS),
+        _job("rooms_1k", "Rooms, paths of 5 bounces", f"rooms:1000,{path}"),
+        _job("fog_open_1k", "Field in fog, 3 bounces", f"fog_open:1000,{fog}"),
+        _job("glossy_1k", "Rough metal, 1,000 lamps", "glossy:1000", family="glossy"),
+        _job("glossy_10k", "Rough metal, 10,000 lamps", "glossy:10000", family="glossy"),
+        _job("behind_wall", "Bright lights behind a wall", "behind_wall:1000"),
+        _job("bright_far", "One bright light far away", "bright_far:1000"),
+        _job("one_light", "A single point light", "open_plane:1"),
+        _boundary(),
+    ]
+
+
+def quick() -> list[Job]:
+    """Return the scenes of ``--quick``, direct light only."""
+    return [
+        *(_city(lights) for lights in (100, 10_000)),
+        _job("city_points_1k", "City, 1,000 points", "city:1000,kind=points"),
+        _boundary(),
+    ]
+
+
+def all_methods() -> list[Method]:
+    """Return every method, with default parameters."""
+    return [Method(name) for name in methods.NAMES]
+
+
+def _city(lights: int, sweeps: tuple[str, ...] = ()) -> Job:
+    short = f"{lights // 10**6}M" if lights >= 10**6 else f"{lights // 1000}k"
+    name = f"city_{short if lights >= 1000 else lights}"
+    return _job(name, f"City, {lights:,} lit triangles", f"city:{lights}", sweeps, family="city")
+
+
+def _boundary() -> Job:
+    job = _job("cut_boundary", "Strip of a floor under three clusters", "cut_boundary:300")
+    job.boundary = True
+    return job
+
+
+def _job(name: str, title: str, source: str, sweeps: tuple[str, ...] = (), family: str = "") -> Job:
+    chosen = [*all_methods(), *(methods.parse(spec) for spec in sweeps)]
+    return Job(scene_source.find(source), chosen, name, title, family or name)
