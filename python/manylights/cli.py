@@ -9,6 +9,7 @@ import sys
 import time
 
 from manylights.errors import one_line
+from manylights.report.cli import add_report
 
 #: Exit status of a command that could not do what was asked.
 FAILURE = 2
@@ -73,6 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_render(commands, common)
     _add_tree(commands, common)
     _add_demo(commands, common)
+    add_report(commands, common)
     return parser
 
 
