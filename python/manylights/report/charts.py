@@ -16,9 +16,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from manylights.report import grouping, pictures
+from manylights.report import grouping
 from manylights.report.results import Results, Scene, Series
 from manylights.report.statistics import (
     CLEARLY_ABOVE,
@@ -73,8 +73,12 @@ WIDTH, HEIGHT = 5.0, 4.3
 #: Errors in the chart of the time that an error takes.
 TARGETS = (1.0, 0.1, 0.01, 0.001)
 
-ERROR = "relative MSE"
+ERROR = "relative MSE (trimmed)"
 TIME = "time of the render (s)"
+
+
+#: Standard deviation by column of some series of a scene.
+Deviations = dict[Scene, list[tuple[Series, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,7 @@ class Chart:
     svg: bytes
 
 
-def draw_all(results: Results, folder: Path) -> dict[str, list[Chart]]:
+def draw_all(results: Results, deviations: Deviations, folder: Path) -> dict[str, list[Chart]]:
     """Draw all charts that there are data for, write them, and return them by kind."""
     folder.mkdir(exist_ok=True)
     kinds = {
@@ -96,19 +100,24 @@ def draw_all(results: Results, folder: Path) -> dict[str, list[Chart]]:
         "reach": _reaches,
         "lights": _light_counts,
         "sweeps": _sweeps,
-        "boundary": _boundaries,
     }
     with matplotlib.rc_context(STYLE):
-        return {
+        drawn = {
             kind: [_save(*chart, folder) for chart in draw(results)] for kind, draw in kinds.items()
         }
+        drawn["boundary"] = [_save(*chart, folder) for chart in _boundaries(deviations)]
+    return drawn
 
 
 def _save(name: str, title: str, alt: str, figure: Figure, folder: Path) -> Chart:
+    if len(figure.axes) < 4:
+        figure.suptitle(title, fontsize=11)
     svg = io.BytesIO()
     # Without the date the same measurements give the same bytes.
     figure.savefig(svg, format="svg", metadata={"Date": None})
     (folder / f"{name}.svg").write_bytes(svg.getvalue())
+    # Placing everything takes most of the time, and the places are known now.
+    figure.set_layout_engine("none")
     figure.savefig(folder / f"{name}.png")
     return Chart(name, title, alt, svg.getvalue())
 
@@ -124,11 +133,13 @@ def _overview(results: Results) -> Iterator[tuple]:
     rows = math.ceil(len(scenes) / columns)
     figure = Figure(figsize=(max(WIDTH, 3.4 * columns), 2.7 * rows + 0.8), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
-    handles = {}
+    handles, extra = {}, {}
     for axes, scene in zip(grid.flat, scenes):
         for series in grouping.one_a_method(scene):
             handles[series.method] = _error_line(axes, series, scene, "-", series.method)
-        _finish_error_time(axes, scene)
+        extra.update((line.get_label(), line) for line in _finish_error_time(axes, scene))
+        if _some_limited(scene):
+            extra["limited"] = _hollow("limited by the reference")
         axes.set_title(scene.title)
     for axes in grid.flat[len(scenes) :]:
         axes.set_axis_off()
@@ -137,9 +148,8 @@ def _overview(results: Results) -> Iterator[tuple]:
     for index in range(len(scenes)):
         if index + columns >= len(scenes):
             grid.flat[index].set_xlabel("time (s)")
-    named = [handles[method] for method in LOOKS if method in handles]
-    named += [handle for method, handle in handles.items() if method not in LOOKS]
-    _legend(figure, named, max(2, columns + 1))
+    named = [handles[method] for method in _ordered(handles)]
+    _legend(figure, [*named, *extra.values()], max(2, columns + 1))
     alt = f"Error against time in {len(scenes)} scenes, one line a method."
     yield "overview", "All scenes", alt, figure
 
@@ -170,10 +180,16 @@ def _error_time(scene: Scene) -> Figure:
         handles.append(_error_line(axes, series, scene, dash, grouping.label(series)))
     handles += _finish_error_time(axes, scene)
     axes.set(xlabel=TIME, ylabel=ERROR)
-    if any(is_limited(point, scene) for series in scene.series for point in series.points):
+    if _some_limited(scene):
         handles.append(_hollow("limited by the reference"))
     _legend(figure, handles)
     return figure
+
+
+def _some_limited(scene: Scene) -> bool:
+    """Whether the chart of a scene has hollow markers."""
+    shown = grouping.shown(scene)
+    return any(is_limited(point, scene) for series in shown for point in series.points)
 
 
 def _error_line(axes, series: Series, scene: Scene, dash: str, label: str) -> Line2D:
@@ -204,9 +220,10 @@ def _finish_error_time(axes, scene: Scene) -> list[Line2D]:
     axes.set_xlim(times.min() / 1.3, times.max() * 1.3)
     axes.set_ylim(errors.min() / 2, errors.max() * 2)
     span = np.array([times.min(), times.max()])
-    middle = math.exp(np.log(errors * times).mean())
+    # Below all lines, where it hides none
+    level = (errors * times).min() / 2.5
     style = {"color": "#999999", "linewidth": 1.0, "zorder": 1}
-    guide = axes.plot(span, middle / span, linestyle=(0, (6, 3)), label="slope -1", **style)
+    guide = axes.plot(span, level / span, linestyle=(0, (6, 3)), label="slope -1", **style)
     own = scene.reference["error"]
     if own > errors.min() / (2 * CLEARLY_ABOVE):
         axes.set_ylim(bottom=min(own / 1.5, errors.min() / 2))
@@ -244,11 +261,12 @@ def _reach_text(row: tuple) -> str:
 
 
 def _reach(rows: list[tuple]) -> Figure:
-    methods = [name for name in LOOKS if any(name in reached for _, reached in rows)]
-    methods += sorted({name for _, reached in rows for name in reached} - set(LOOKS))
-    figure, axes = _figure(1.5 + 0.42 * len(rows) + 0.1 * len(methods))
+    methods = _ordered({name for _, reached in rows for name in reached})
+    figure, axes = _figure(1.6 + 0.5 * len(rows) + 0.1 * len(methods))
     handles = {}
     for row, (_, reached) in enumerate(rows):
+        if row % 2:
+            axes.axhspan(row - 0.5, row + 0.5, color="#f3f3f0", zorder=0)
         for method, reach in reached.items():
             # Markers of one scene are spread, so that none hides another.
             shift = (methods.index(method) + 0.5) / len(methods) - 0.5
@@ -257,11 +275,12 @@ def _reach(rows: list[tuple]) -> Figure:
             time = reach.seconds
             look = {"color": color, "marker": marker, "linestyle": ""}
             if time.known:
-                axes.plot([time.low, time.high], [row + 0.7 * shift] * 2, color=color, alpha=0.5)
-            axes.plot(time.value, row + 0.7 * shift, markerfacecolor=face, zorder=3, **look)
+                axes.plot([time.low, time.high], [row + 0.8 * shift] * 2, color=color, alpha=0.5)
+            axes.plot(time.value, row + 0.8 * shift, markerfacecolor=face, zorder=3, **look)
             handles[method] = Line2D([], [], label=method, **look)
     axes.set_yticks(range(len(rows)), [scene.name for scene, _ in rows])
-    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.grid(False, axis="y")
     axes.set(xscale="log", xlabel="time (s)")
     _log_ticks(axes, "x")
     extra = [_hollow("continued with slope -1")]
@@ -283,7 +302,7 @@ def _light_counts(results: Results) -> Iterator[tuple]:
 
 def _lights(scenes: list[Scene]) -> Figure:
     chosen = {scene: grouping.one_a_method(scene) for scene in scenes}
-    methods = dict.fromkeys(series.method for group in chosen.values() for series in group)
+    methods = _ordered({series.method for group in chosen.values() for series in group})
     builds = any(series.build_seconds > 0 for group in chosen.values() for series in group)
     figure = Figure(figsize=(WIDTH, 7.6 if builds else 5.6), layout="constrained")
     panels = figure.subplots(3 if builds else 2, 1, sharex=True)
@@ -370,15 +389,12 @@ def _sweep(scene: Scene, parameter: str, groups: list[list[tuple]]) -> Figure:
 # --- Standard deviation across a boundary of the cut ------------------------------------------
 
 
-def _boundaries(results: Results) -> Iterator[tuple]:
-    for scene in results.scenes:
-        if scene.boundary:
-            lines = pictures.deviation_lines(scene, grouping.shown(scene))
-            if lines:
-                alt = f"Standard deviation of one sample along the columns of {scene.title}: " + (
-                    "; ".join(f"{grouping.label(one)} {_range(line)}" for one, line in lines)
-                )
-                yield f"boundary_{scene.name}", scene.title, alt, _boundary(lines)
+def _boundaries(deviations: Deviations) -> Iterator[tuple]:
+    for scene, lines in deviations.items():
+        if lines:
+            ranges = "; ".join(f"{grouping.label(one)} {_range(line)}" for one, line in lines)
+            alt = f"Standard deviation of one sample by column in {scene.title}: {ranges}"
+            yield f"boundary_{scene.name}", scene.title, alt, _boundary(lines)
 
 
 def _range(line: np.ndarray) -> str:
@@ -432,6 +448,12 @@ def _curve(axes, method, positions, intervals: list[Interval], label, dash="-") 
     return Line2D([], [], **look)
 
 
+def _ordered(methods) -> list[str]:
+    """Sort names of methods: ours first, unknown ones last."""
+    known = [name for name in LOOKS if name in methods]
+    return known + sorted(set(methods) - set(known))
+
+
 def _hollow(label: str) -> Line2D:
     return Line2D(
         [], [], color="#555555", marker="o", markerfacecolor="white", linestyle="", label=label
@@ -446,12 +468,13 @@ def _log_ticks(axes, which: str = "both") -> None:
     """Label powers of ten; over less than 1.5 decades also their multiples by 2 and 5."""
     for name in ("x", "y") if which == "both" else (which,):
         axis = getattr(axes, f"{name}axis")
-        low, high = axis.get_view_interval()
+        low, high = getattr(axes, f"get_{name}lim")()
         decades = math.log10(high / low) if low > 0 else 1.0
         steps = (1.0, 2.0, 5.0) if decades < 1.5 else (1.0,)
         axis.set_major_locator(LogLocator(subs=steps, numticks=8))
         axis.set_major_formatter(FuncFormatter(_tick))
-        axis.set_minor_formatter(NullFormatter())
+        # Unlabelled ticks between them would take half of the time of drawing.
+        axis.set_minor_locator(NullLocator())
 
 
 def _tick(value: float, _position: int) -> str:

@@ -58,7 +58,9 @@ def shown(scene: Scene) -> list[Series]:
     for group in groups.values():
         if not group[0].ours:
             keep += [series for series in group if not set(series.parameters) & set(SWEPT)]
-    return [series for series in scene.series if series in keep]
+    order = list(dict.fromkeys(series.method for series in keep))
+    chosen = [series for series in scene.series if series in keep]
+    return sorted(chosen, key=lambda series: order.index(series.method))
 
 
 def peers(scene: Scene) -> list[Series]:

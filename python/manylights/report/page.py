@@ -76,7 +76,12 @@ def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
     """Return the page's text and remarks; write the charts."""
     remarks: list[str] = []
     visible = _scene_pictures(data, publish, remarks)
-    drawn = charts.draw_all(data, data.folder / CHART_FOLDER)
+    deviations = {
+        scene: pictures.deviation_lines(scene, grouping.shown(scene), remarks)
+        for scene in data.scenes
+        if scene.boundary
+    }
+    drawn = charts.draw_all(data, deviations, data.folder / CHART_FOLDER)
     losses = [row for row in tables.efficiencies(data, every=True) if row.lost]
     compared = len(tables.efficiencies(data, every=True))
     text = (
@@ -94,7 +99,7 @@ def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
             compared=compared,
             biases=tables.biases(data),
             times=tables.times(data),
-            steps=_steps(data),
+            steps=_steps(deviations),
             methods=_methods(data),
             seeds=_seeds(data),
             targets=charts.TARGETS,
@@ -132,14 +137,12 @@ def _scene_pictures(data, publish: bool, remarks: list[str]) -> list[pictures.Sc
     return found
 
 
-def _steps(data) -> list[Steps]:
-    rows = []
-    for scene in data.scenes:
-        if scene.boundary:
-            for series, line in pictures.deviation_lines(scene, grouping.shown(scene)):
-                step = pictures.largest_step(line)
-                rows.append(Steps(scene, grouping.label(series), line.min(), line.max(), step))
-    return rows
+def _steps(deviations: charts.Deviations) -> list[Steps]:
+    return [
+        Steps(scene, grouping.label(series), line.min(), line.max(), pictures.largest_step(line))
+        for scene, lines in deviations.items()
+        for series, line in lines
+    ]
 
 
 def _methods(data) -> dict[str, str]:

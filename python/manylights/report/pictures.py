@@ -88,13 +88,17 @@ def scene_pictures(scene: Scene, epsilon: float, remarks: list[str]) -> ScenePic
     return ScenePictures(scene, whole, _percent(window, reference), crops, maps)
 
 
-def deviation_lines(scene: Scene, chosen: list[Series]) -> list[tuple[Series, np.ndarray]]:
+def deviation_lines(
+    scene: Scene, chosen: list[Series], remarks: list[str]
+) -> list[tuple[Series, np.ndarray]]:
     """Standard deviation of one sample by column, from the variance images that there are."""
     lines = []
     for series in chosen:
-        if (scene.folder / f"{series.key}.variance.exr").exists():
-            variance = read_image(scene, f"{series.key}.variance.exr")
-            lines.append((series, np.sqrt(variance.mean(axis=(0, 2)))))
+        name = f"{series.key}.variance.exr"
+        if (scene.folder / name).exists():
+            lines.append((series, np.sqrt(read_image(scene, name).mean(axis=(0, 2)))))
+        else:
+            remarks.append(f"{scene.name}/{name}: missing, its line is left out")
     return lines
 
 

@@ -56,7 +56,7 @@ class Estimate:
         return Estimate(self.value - other.value, total, freedom)
 
     def interval(self) -> Interval:
-        quantile = stdtrit(min(self.freedom, 1e9), (1 + LEVEL) / 2)
+        quantile = float(stdtrit(min(self.freedom, 1e9), (1 + LEVEL) / 2))
         half = quantile * math.sqrt(self.variance)
         return Interval(self.value, self.value - half, self.value + half)
 
