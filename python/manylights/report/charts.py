@@ -86,7 +86,6 @@ class Chart:
     """One chart; the files are charts/NAME.svg and charts/NAME.png."""
 
     name: str
-    title: str
     alt: str
     svg: bytes
 
@@ -110,8 +109,14 @@ def draw_all(results: Results, deviations: Deviations, folder: Path) -> dict[str
 
 
 def _save(name: str, title: str, alt: str, figure: Figure, folder: Path) -> Chart:
+    # Small multiples have titles of their own.
     if len(figure.axes) < 4:
         figure.suptitle(title, fontsize=11)
+    return Chart(name, alt, save(name, figure, folder))
+
+
+def save(name: str, figure: Figure, folder: Path) -> bytes:
+    """Write a figure as SVG and PNG, and return the SVG."""
     svg = io.BytesIO()
     # Without the date the same measurements give the same bytes.
     figure.savefig(svg, format="svg", metadata={"Date": None})
@@ -119,7 +124,7 @@ def _save(name: str, title: str, alt: str, figure: Figure, folder: Path) -> Char
     # Placing everything takes most of the time, and the places are known now.
     figure.set_layout_engine("none")
     figure.savefig(folder / f"{name}.png")
-    return Chart(name, title, alt, svg.getvalue())
+    return svg.getvalue()
 
 
 # --- Error against time -----------------------------------------------------------------------
@@ -465,12 +470,12 @@ def _legend(figure: Figure, handles: list[Line2D], columns: int = 2) -> None:
 
 
 def _log_ticks(axes, which: str = "both") -> None:
-    """Label powers of ten; over less than 1.5 decades also their multiples by 2 and 5."""
+    """Label powers of ten; over about two decades also their multiples by 2 and 5."""
     for name in ("x", "y") if which == "both" else (which,):
         axis = getattr(axes, f"{name}axis")
         low, high = getattr(axes, f"get_{name}lim")()
         decades = math.log10(high / low) if low > 0 else 1.0
-        steps = (1.0, 2.0, 5.0) if decades < 1.5 else (1.0,)
+        steps = (1.0, 2.0, 5.0) if decades < 2.2 else (1.0,)
         axis.set_major_locator(LogLocator(subs=steps, numticks=8))
         axis.set_major_formatter(FuncFormatter(_tick))
         # Unlabelled ticks between them would take half of the time of drawing.

@@ -11,7 +11,7 @@ import jinja2
 import numpy as np
 
 from manylights.errors import UsageError
-from manylights.report import charts, grouping, pictures, results, statistics, tables
+from manylights.report import charts, grouping, pictures, results, sheets, statistics, tables
 
 PAGE_NAME, CHART_FOLDER = "report.html", "charts"
 
@@ -81,7 +81,11 @@ def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
         for scene in data.scenes
         if scene.boundary
     }
-    drawn = charts.draw_all(data, deviations, data.folder / CHART_FOLDER)
+    folder = data.folder / CHART_FOLDER
+    drawn = charts.draw_all(data, deviations, folder)
+    sheets.write_sheets(visible, folder)
+    if publish:
+        sheets.remove_sheets([scene for scene in data.scenes if scene.private], folder)
     losses = [row for row in tables.efficiencies(data, every=True) if row.lost]
     compared = len(tables.efficiencies(data, every=True))
     text = (
@@ -179,7 +183,7 @@ def _ratio(interval: statistics.Interval) -> str:
 
 
 def _percent(value: float) -> str:
-    return "n/a" if not np.isfinite(value) else f"{100 * value:+.2f} %"
+    return "n/a" if not np.isfinite(value) else f"{100 * value:+.3f} %"
 
 
 def _svg_uri(chart: charts.Chart) -> str:

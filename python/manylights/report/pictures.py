@@ -32,23 +32,38 @@ MAPS = {"candidates": "Candidates (N')", "node_visits": "Node visits"}
 
 @dataclass(frozen=True)
 class Picture:
-    """An image as a data address, with what is written under it."""
+    """An image of 8 bits a channel, with what is written under it."""
 
     label: str
-    uri: str
+    pixels: np.ndarray
     alt: str
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def uri(self) -> str:
+        """The image as an address that is its content."""
+        stream = io.BytesIO()
+        matplotlib.image.imsave(stream, self.pixels, format="png")
+        return data_uri("image/png", stream.getvalue())
 
 
 @dataclass(frozen=True)
 class MapRow:
-    """Maps of one quantity on one scale."""
+    """Maps of one quantity on one scale; ``colors`` is matplotlib's name of the colours."""
 
     title: str
-    low: str
-    high: str
+    low: float
+    high: float
+    logarithmic: bool
     colors: str
     pictures: list[Picture]
+
+    @property
+    def gradient(self) -> str:
+        """The colours as a CSS gradient, for the scale."""
+        stops = matplotlib.colormaps[self.colors](np.linspace(0, 1, 9), bytes=True)[:, :3]
+        texts = [f"rgb({', '.join(map(str, stop))})" for stop in stops]
+        return f"linear-gradient(to right, {', '.join(texts)})"
 
 
 @dataclass(frozen=True)
@@ -79,11 +94,11 @@ def scene_pictures(scene: Scene, epsilon: float, remarks: list[str]) -> ScenePic
     exposure = _exposure(reference)
     crops = [Picture("reference", _tone_mapped(reference[window], exposure), "reference, crop")]
     for series, image in zip(chosen, images):
-        uri = _tone_mapped(image[window], exposure)
+        pixels = _tone_mapped(image[window], exposure)
         name = grouping.label(series)
         alt = f"{name}, crop, error {series.equal_time['error_trimmed']:.2g}"
-        crops.append(Picture(name, uri, alt, _numbers(series)))
-    maps = [_error_maps(chosen, images, reference, epsilon), *_count_maps(scene, remarks)]
+        crops.append(Picture(name, pixels, alt, _numbers(series)))
+    maps = [_error_maps(chosen, images, reference, epsilon), *_count_maps(scene, chosen, remarks)]
     whole = Picture(scene.title, _tone_mapped(_shrink(reference), exposure), "reference, whole")
     return ScenePictures(scene, whole, _percent(window, reference), crops, maps)
 
@@ -200,7 +215,7 @@ def _error_maps(chosen, images, reference, epsilon: float) -> MapRow:
         alt = f"{name}: map of the error"
         pictures.append(Picture(name, _colored(shade, ERROR_COLORS), alt, _numbers(series)[1:2]))
     title = "Relative squared error"
-    return MapRow(title, f"{low:g}", f"{high:g}", _gradient(ERROR_COLORS), pictures)
+    return MapRow(title, low, high, True, ERROR_COLORS, pictures)
 
 
 def _relative_error(image: np.ndarray, reference: np.ndarray, epsilon: float) -> np.ndarray:
@@ -220,10 +235,10 @@ def _decades(errors: list[np.ndarray]) -> tuple[float, float]:
     return max(10.0 ** math.floor(math.log10(low)), high / 1e6), high
 
 
-def _count_maps(scene: Scene, remarks: list[str]) -> list[MapRow]:
+def _count_maps(scene: Scene, chosen: list[Series], remarks: list[str]) -> list[MapRow]:
     """Maps of what our methods counted, for those whose file is there."""
     found = []
-    for series in grouping.shown(scene):
+    for series in chosen:
         # Mitsuba's own integrators count nothing.
         if series.method not in ("uniform", "power"):
             name = f"{series.key}.maps.exr"
@@ -244,9 +259,9 @@ def _count_row(scene: Scene, title: str, key: str, found: list) -> MapRow | None
     for series, count in counts:
         name = grouping.label(series)
         mean = f"mean {count.mean():.3g}"
-        uri = _colored(_shrink(count) / high, COUNT_COLORS)
-        pictures.append(Picture(name, uri, f"{name}: {title}, {mean}", [mean]))
-    return MapRow(f"{title} per sample", "0", f"{high:.3g}", _gradient(COUNT_COLORS), pictures)
+        pixels = _colored(_shrink(count) / high, COUNT_COLORS)
+        pictures.append(Picture(name, pixels, f"{name}: {title}, {mean}", [mean]))
+    return MapRow(f"{title} per sample", 0.0, high, False, COUNT_COLORS, pictures)
 
 
 def _shrink(image: np.ndarray) -> np.ndarray:
@@ -261,27 +276,15 @@ def _shrink(image: np.ndarray) -> np.ndarray:
     return blocks.mean(axis=(1, 3))
 
 
-def _tone_mapped(image: np.ndarray, exposure: float) -> str:
+def _tone_mapped(image: np.ndarray, exposure: float) -> np.ndarray:
+    """Apply the exposure and the curve of sRGB."""
     linear = np.clip(image * exposure, 0, 1)
     curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return _png(curve)
+    return np.round(255 * curve).astype(np.uint8)
 
 
-def _colored(shade: np.ndarray, colors: str) -> str:
-    return _png(matplotlib.colormaps[colors](np.clip(shade, 0, 1))[..., :3])
-
-
-def _gradient(colors: str) -> str:
-    """The colours of a map as a CSS gradient, for its scale."""
-    stops = matplotlib.colormaps[colors](np.linspace(0, 1, 9))
-    texts = [f"rgb({', '.join(str(round(255 * part)) for part in stop[:3])})" for stop in stops]
-    return f"linear-gradient(to right, {', '.join(texts)})"
-
-
-def _png(image: np.ndarray) -> str:
-    stream = io.BytesIO()
-    matplotlib.image.imsave(stream, np.round(255 * image).astype(np.uint8), format="png")
-    return data_uri("image/png", stream.getvalue())
+def _colored(shade: np.ndarray, colors: str) -> np.ndarray:
+    return matplotlib.colormaps[colors](np.clip(shade, 0, 1), bytes=True)[..., :3]
 
 
 def data_uri(kind: str, data: bytes) -> str:
