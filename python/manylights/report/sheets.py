@@ -13,8 +13,9 @@ from manylights.report.charts import STYLE, save
 from manylights.report.pictures import MapRow, Picture, ScenePictures
 from manylights.report.results import Scene
 
-#: Inches of a picture, and of the text under it.
-WIDTH, TEXT_HEIGHT = 1.75, 0.75
+# All in inches: the width of a picture and the gap between two, what a line of text takes, the
+# place of a colour scale with its numbers, and the margin.
+WIDTH, GAP, LINE, SCALE, MARGIN = 1.75, 0.12, 0.15, 0.75, 0.12
 
 
 def write_sheets(found: list[ScenePictures], folder: Path) -> None:
@@ -36,33 +37,58 @@ def _name(scene: Scene) -> str:
 
 
 def _sheet(pictures: ScenePictures) -> Figure:
+    """Lay out by hand: matplotlib's own layout of so many axes takes seconds."""
+    shape = pictures.scene.height / pictures.scene.width
     # Each method has a column.
     labels = [crop.label for crop in pictures.crops]
-    columns, rows = len(labels), 1 + len(pictures.maps)
-    flat = WIDTH * pictures.scene.height / pictures.scene.width + TEXT_HEIGHT
-    heights = [WIDTH + TEXT_HEIGHT, *[flat] * len(pictures.maps)]
-    figure = Figure(figsize=(WIDTH * columns + 1, sum(heights) + 0.4), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
-    for axes in grid.flat:
-        axes.set_axis_off()
-    for axes, crop in zip(grid[0], pictures.crops):
-        _show(axes, crop)
-    for line, row in zip(grid[1:], pictures.maps):
-        for picture in row.pictures:
-            _show(line[labels.index(picture.label)], picture)
-        figure.colorbar(_scale(row), ax=line, label=row.title, shrink=0.8, aspect=12)
-    title = pictures.scene.title
-    if pictures.scene.equal_time:
-        title += f", {pictures.scene.equal_time:g} s each"
-    figure.suptitle(title, fontsize=11)
+    rows = [(pictures.crops, WIDTH, None)]
+    rows += [(row.pictures, WIDTH * shape, row) for row in pictures.maps]
+    heights = [_text_lines(row) * LINE + height + GAP for row, height, _ in rows]
+    width = len(labels) * (WIDTH + GAP) + SCALE + 2 * MARGIN
+    top = sum(heights) + 2 * LINE + 2 * MARGIN
+    figure = Figure(figsize=(width, top))
+
+    def place(left, bottom, wide, high):
+        return figure.add_axes([left / width, bottom / top, wide / width, high / top])
+
+    _title(figure, pictures.scene)
+    bottom = top - MARGIN - 2 * LINE
+    for (row, height, scale), step in zip(rows, heights):
+        low = bottom - 1.3 * LINE - height
+        for picture in row:
+            left = MARGIN + labels.index(picture.label) * (WIDTH + GAP)
+            _show(place(left, low, WIDTH, height), picture)
+        if scale:
+            axes = place(MARGIN + len(labels) * (WIDTH + GAP), low, 0.1, height)
+            figure.colorbar(_scale(scale), cax=axes, label=scale.title.replace(" per", "\nper"))
+        bottom -= step
     return figure
 
 
+def _text_lines(row: list[Picture]) -> float:
+    """Lines of text above and under a row, with some space."""
+    return max(len(picture.notes) for picture in row) + 2
+
+
+def _title(figure: Figure, scene: Scene) -> None:
+    title = scene.title + (f", {scene.equal_time:g} s each" if scene.equal_time else "")
+    height = figure.get_figheight()
+    figure.text(0.5, 1 - MARGIN / height, title, ha="center", va="top", fontsize=11)
+
+
 def _show(axes, picture: Picture) -> None:
-    axes.imshow(picture.pixels, interpolation="none")
-    axes.set_title(picture.label, fontsize=8)
-    notes = "\n".join(picture.notes)
-    axes.text(0.5, -0.04, notes, transform=axes.transAxes, ha="center", va="top")
+    axes.set_axis_off()
+    axes.imshow(picture.pixels, interpolation="none", aspect="auto")
+    axes.set_title(picture.label, fontsize=8, pad=3)
+    axes.annotate(
+        "\n".join(picture.notes),
+        (0.5, 0),
+        (0, -3),
+        xycoords="axes fraction",
+        textcoords="offset points",
+        ha="center",
+        va="top",
+    )
 
 
 def _scale(row: MapRow) -> ScalarMappable:
