@@ -181,6 +181,18 @@ def test_sweeps_may_reach_infinity():
     assert [value for value, _ in group] == list(rates)
 
 
+def test_the_default_by_name_is_the_default():
+    """Sweeps measure it once more; charts have it once."""
+    points = [(1, 1.0, 1.0)]
+    plain, better = series_of(points), [(1, 0.9, 1.0)]
+    named = series_of(better, shadow_rays=4)
+    others = [series_of(points, shadow_rays=count) for count in (1, 8)]
+    scene = scene_of(plain, named, *others)
+    assert grouping.shown(scene) == [plain]
+    (group,) = grouping.sweeps(scene, "shadow_rays")
+    assert group == [(1, others[0]), (4, named), (8, others[1])]
+
+
 def test_a_family_is_ordered_by_lights(data):
     (family,) = grouping.families(data).values()
     assert [scene.lights for scene in family] == [100, 10_000]
@@ -308,6 +320,26 @@ def test_only_one_method_and_one_point(small):
     assert "nothing to compare" in text
 
 
+def test_an_interrupted_run_is_shown_as_far_as_it_came(small, undrawn):
+    def change(data):
+        (scene,) = data["scenes"]
+        series = {entry["spec"]: entry for entry in scene["series"]}
+        series["uniform"].update(points=[], equal_time=None)
+        for values in series["talk"]["points"][4].values():
+            if isinstance(values, list):
+                values.clear()
+        data["scenes"].append({**scene, "name": "next", "reference": None, "series": []})
+
+    data = results.load(small(change))
+    assert [[series.spec for series in scene.series] for scene in data.scenes] == [
+        ["talk", "resampled_tree"]
+    ]
+    assert [len(series.points) for series in data.scenes[0].series] == [4, 5]
+    text, remarks = page.render(data, publish=False)
+    assert [remark.split(":")[0] for remark in remarks] == ["room, uniform", "room, talk", "next"]
+    assert "room, uniform: points not rendered yet" in text
+
+
 def test_no_scenes(small):
     text, _ = page.render(results.load(small(lambda data: data["scenes"].clear())), publish=False)
     assert "0 scenes" in text
@@ -319,6 +351,13 @@ def test_missing_maps_are_left_out_with_a_remark(small, undrawn):
     text, remarks = page.render(results.load(path), publish=False)
     assert any("talk.maps.exr" in remark for remark in remarks)
     assert "talk.maps.exr" in text and "resampled_tree.maps.exr" not in text
+
+
+def test_maps_without_channels_are_told(small, undrawn):
+    path = small()
+    report_data.write_exr(path / "room" / "talk.maps.exr", np.ones((45, 80, 3)))
+    _, remarks = page.render(results.load(path), publish=False)
+    assert remarks == ["room/talk.maps.exr: has no channel candidates, node_visits"]
 
 
 def test_missing_variance_is_left_out_with_a_remark(small):
@@ -365,8 +404,8 @@ def leave_folder(data):
     data["scenes"][0]["name"] = "../other"
 
 
-def set_zero(data):
-    data["scenes"][0]["series"][0]["points"][0]["error_trimmed"] = [0.0] * report_data.SEEDS
+def set_negative(data):
+    data["scenes"][0]["series"][0]["points"][0]["error_trimmed"][1] = -1.0
 
 
 def repeat_scene(data):
@@ -382,7 +421,7 @@ def repeat_scene(data):
         (set_text, r"scenes\[0\]\.lights: str instead of int"),
         (set_nan, "reference.error: nan is not a finite number"),
         (leave_folder, r"scenes\[0\]\.name: '../other' cannot be part of a file name"),
-        (set_zero, r"points\[0\]\.error_trimmed: must be positive"),
+        (set_negative, r"points\[0\]\.error_trimmed: negative"),
         (repeat_scene, "room is there twice"),
     ],
 )

@@ -109,8 +109,7 @@ def draw_all(results: Results, deviations: Deviations, folder: Path) -> dict[str
 
 
 def _save(name: str, title: str, alt: str, figure: Figure, folder: Path) -> Chart:
-    # Small multiples have titles of their own.
-    if len(figure.axes) < 4:
+    if title:
         figure.suptitle(title, fontsize=11)
     return Chart(name, alt, save(name, figure, folder))
 
@@ -156,7 +155,8 @@ def _overview(results: Results) -> Iterator[tuple]:
     named = [handles[method] for method in _ordered(handles)]
     _legend(figure, [*named, *extra.values()], max(2, columns + 1))
     alt = f"Error against time in {len(scenes)} scenes, one line a method."
-    yield "overview", "All scenes", alt, figure
+    # Each of the small charts has its title.
+    yield "overview", "", alt, figure
 
 
 def _error_times(results: Results) -> Iterator[tuple]:

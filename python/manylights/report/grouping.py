@@ -58,9 +58,12 @@ def shown(scene: Scene) -> list[Series]:
     for group in groups.values():
         if not group[0].ours:
             keep += [series for series in group if not set(series.parameters) & set(SWEPT)]
+    # A peer's best may be its default under another name: the longer name is left out.
+    distinct = {}
+    for series in sorted(keep, key=lambda series: len(series.parameters)):
+        distinct.setdefault(_without(series, ()), series)
     order = list(dict.fromkeys(series.method for series in keep))
-    chosen = [series for series in scene.series if series in keep]
-    return sorted(chosen, key=lambda series: order.index(series.method))
+    return sorted(distinct.values(), key=lambda series: order.index(series.method))
 
 
 def peers(scene: Scene) -> list[Series]:
@@ -70,13 +73,14 @@ def peers(scene: Scene) -> list[Series]:
 
 def sweeps(scene: Scene, parameter: str) -> list[list[tuple[Any, Series]]]:
     """Series that differ in ``parameter`` only, as lists of (value, series) with rising values."""
-    groups = defaultdict(list)
-    for series in scene.series:
+    groups = defaultdict(dict)
+    # A series that names the default comes later and replaces the one that does not.
+    for series in sorted(scene.series, key=lambda series: len(series.parameters)):
         if series.method not in ("uniform", "power"):
             value = series.parameters.get(parameter, SWEPT[parameter])
-            groups[_without(series, (parameter,))].append((value, series))
+            groups[_without(series, (parameter,))][float(value)] = (value, series)
     long = [group for group in groups.values() if len(group) >= MIN_SWEEP]
-    return [sorted(group, key=lambda entry: float(entry[0])) for group in long]
+    return [[group[value] for value in sorted(group)] for group in long]
 
 
 def families(results: Results) -> dict[str, list[Scene]]:
@@ -93,6 +97,10 @@ def families(results: Results) -> dict[str, list[Scene]]:
 
 
 def _without(series: Series, names: tuple[str, ...]) -> tuple:
-    """What identifies a series apart from the parameters ``names``."""
-    left = {key: str(value) for key, value in series.parameters.items() if key not in names}
+    """What identifies a series apart from the parameters ``names``, and from defaults."""
+    left = {
+        key: str(value)
+        for key, value in series.parameters.items()
+        if key not in names and value != SWEPT.get(key)
+    }
     return (series.method, *sorted(left.items()))

@@ -74,7 +74,7 @@ def _check_target(target: Path) -> None:
 
 def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
     """Return the page's text and remarks; write the charts."""
-    remarks: list[str] = []
+    remarks = list(data.remarks)
     visible = _scene_pictures(data, publish, remarks)
     deviations = {
         scene: pictures.deviation_lines(scene, grouping.shown(scene), remarks)
@@ -183,7 +183,8 @@ def _ratio(interval: statistics.Interval) -> str:
 
 
 def _percent(value: float) -> str:
-    return "n/a" if not np.isfinite(value) else f"{100 * value:+.3f} %"
+    sign = "-" if value < 0 else "+"
+    return "n/a" if not np.isfinite(value) else f"{sign}{_number(abs(100 * value))} %"
 
 
 def _svg_uri(chart: charts.Chart) -> str:

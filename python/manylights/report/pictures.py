@@ -246,11 +246,15 @@ def _count_maps(scene: Scene, chosen: list[Series], remarks: list[str]) -> list[
                 found.append((series, _read(scene, name)))
             else:
                 remarks.append(f"{scene.name}/{name}: missing, its maps are left out")
-    rows = [_count_row(scene, title, key, found) for key, title in MAPS.items()]
+    for series, channels in found:
+        lacking = ", ".join(key for key in MAPS if key not in channels)
+        if lacking:
+            remarks.append(f"{scene.name}/{series.key}.maps.exr: has no channel {lacking}")
+    rows = [_count_row(title, key, found) for key, title in MAPS.items()]
     return [row for row in rows if row]
 
 
-def _count_row(scene: Scene, title: str, key: str, found: list) -> MapRow | None:
+def _count_row(title: str, key: str, found: list) -> MapRow | None:
     counts = [(series, channels[key]) for series, channels in found if key in channels]
     if not counts:
         return None

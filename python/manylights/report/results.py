@@ -75,7 +75,7 @@ SCENE = {
     "private": bool,
     "boundary": bool,
     "equal_time": Maybe(NUMBER),
-    "reference": REFERENCE,
+    "reference": Maybe(REFERENCE),
     "series": [SERIES],
     "skipped": Maybe([{"spec": str, "why": str}]),
 }
@@ -152,7 +152,7 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """All of ``results.json``."""
+    """All of ``results.json`` that can be shown; ``remarks`` say what cannot."""
 
     folder: Path
     created: str
@@ -161,6 +161,7 @@ class Results:
     variant: str
     metric: dict[str, float]
     scenes: list[Scene]
+    remarks: list[str]
 
 
 def load(folder: str) -> Results:
@@ -180,8 +181,11 @@ def load(folder: str) -> Results:
         _check_distinct([scene["name"] for scene in data["scenes"]], "scenes")
     except ValueError as error:
         raise UsageError(f"{path}: {error}") from None
-    scenes = [_scene(path.parent, scene) for scene in data["scenes"]]
-    return Results(path.parent, **_fields(data, RESULTS, "scenes"), scenes=scenes)
+    remarks: list[str] = []
+    found = [_scene(path.parent, scene, remarks) for scene in data["scenes"]]
+    scenes = [scene for scene in found if scene]
+    fields = _fields(data, RESULTS, "scenes")
+    return Results(path.parent, **fields, scenes=scenes, remarks=remarks)
 
 
 def _read(path: Path) -> Any:
@@ -237,8 +241,6 @@ def _check_scene(scene: dict[str, Any], where: str) -> None:
     for index, series in enumerate(scene["series"]):
         place = f"{where}.series[{index}]"
         _check_name(series["spec"], SPEC, f"{place}.spec")
-        if not series["points"]:
-            raise ValueError(f"{place}.points: empty")
         for number, point in enumerate(series["points"]):
             _check_point(point, f"{place}.points[{number}]")
     _check_distinct([series["spec"] for series in scene["series"]], f"{where}.series")
@@ -247,15 +249,12 @@ def _check_scene(scene: dict[str, Any], where: str) -> None:
 def _check_point(point: dict[str, Any], where: str) -> None:
     _check_positive(point, ("spp",), where)
     seeds = len(point["seconds"])
-    if not seeds:
-        raise ValueError(f"{where}.seconds: empty")
     for name in ("cpu_seconds", "error", "error_trimmed", "mean"):
         if len(point[name]) != seeds:
             raise ValueError(f"{where}.{name}: {len(point[name])} values for {seeds} seeds")
     for name in ("seconds", "error", "error_trimmed"):
-        # Logarithms are taken of the means of these.
-        if min(point[name]) < 0 or max(point[name]) <= 0:
-            raise ValueError(f"{where}.{name}: must be positive")
+        if min(point[name], default=0) < 0:
+            raise ValueError(f"{where}.{name}: negative")
 
 
 def _check_name(name: str, pattern: re.Pattern, where: str) -> None:
@@ -275,14 +274,29 @@ def _check_distinct(names: list[str], where: str) -> None:
             raise ValueError(f"{where}: {name} is there twice")
 
 
-def _scene(folder: Path, entry: dict[str, Any]) -> Scene:
-    series = [_series(one) for one in entry["series"]]
-    return Scene(folder / entry["name"], **_fields(entry, SCENE, "series"), series=series)
+def _scene(folder: Path, entry: dict[str, Any], remarks: list[str]) -> Scene | None:
+    """Return a scene, None if it has no reference, as after an interrupted run."""
+    name = entry["name"]
+    if entry["reference"] is None:
+        remarks.append(f"{name}: has no reference yet, left out")
+        return None
+    series = [_series(one, name, remarks) for one in entry["series"]]
+    series = [one for one in series if one.points]
+    return Scene(folder / name, **_fields(entry, SCENE, "series"), series=series)
 
 
-def _series(entry: dict[str, Any]) -> Series:
-    points = sorted((_point(point) for point in entry["points"]), key=lambda point: point.spp)
+def _series(entry: dict[str, Any], scene: str, remarks: list[str]) -> Series:
+    """Return a series with the points that have logarithms."""
+    points = [_point(point) for point in entry["points"] if _is_positive(point)]
+    if len(points) < len(entry["points"]) or not points:
+        remarks.append(f"{scene}, {entry['spec']}: points not rendered yet, or with error 0")
+    points.sort(key=lambda point: point.spp)
     return Series(**_fields(entry, SERIES, "points"), points=points)
+
+
+def _is_positive(point: dict[str, Any]) -> bool:
+    """Whether the means of errors and times are positive; those of no seeds are not."""
+    return all(sum(point[name]) > 0 for name in ("seconds", "error", "error_trimmed"))
 
 
 def _point(entry: dict[str, Any]) -> Point:
