@@ -9,7 +9,6 @@ import sys
 import time
 
 from manylights.errors import one_line
-from manylights.report.cli import add_report
 
 #: Exit status of a command that could not do what was asked.
 FAILURE = 2
@@ -58,6 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     from manylights import __version__
+    from manylights.report.cli import add_report
 
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,6 +60,7 @@ STYLE = {
     "grid.linewidth": 0.6,
     "legend.fontsize": 9,
     "legend.frameon": False,
+    "legend.handlelength": 2.8,
     "lines.linewidth": 1.6,
     "lines.markersize": 5.5,
     "savefig.dpi": 160,
@@ -69,6 +71,12 @@ STYLE = {
 
 #: Inches.
 WIDTH, HEIGHT = 5.0, 4.3
+
+#: Inches of a line of the legend.
+LEGEND_ROW = 0.19
+
+#: Letters, beyond which a legend has fewer columns.
+LONG_LABEL = 30
 
 #: Errors in the chart of the time that an error takes.
 TARGETS = (1.0, 0.1, 0.01, 0.001)
@@ -110,7 +118,7 @@ def draw_all(results: Results, deviations: Deviations, folder: Path) -> dict[str
 
 def _save(name: str, title: str, alt: str, figure: Figure, folder: Path) -> Chart:
     if title:
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(plain(title, 56), fontsize=11)
     return Chart(name, alt, save(name, figure, folder))
 
 
@@ -144,7 +152,7 @@ def _overview(results: Results) -> Iterator[tuple]:
         extra.update((line.get_label(), line) for line in _finish_error_time(axes, scene))
         if _some_limited(scene):
             extra["limited"] = _hollow("limited by the reference")
-        axes.set_title(scene.title)
+        axes.set_title(plain(scene.title, 36))
     for axes in grid.flat[len(scenes) :]:
         axes.set_axis_off()
     for axes in grid[:, 0]:
@@ -465,7 +473,17 @@ def _hollow(label: str) -> Line2D:
     )
 
 
+def plain(text: str, width: int) -> str:
+    """Break lines after ``width`` letters, and keep dollar signs from starting a formula."""
+    return textwrap.fill(text, width).replace("$", r"\$")
+
+
 def _legend(figure: Figure, handles: list[Line2D], columns: int = 2) -> None:
+    if max((len(handle.get_label()) for handle in handles), default=0) > LONG_LABEL:
+        columns = max(1, columns // 2)
+    # More lines than usual make the figure taller, not the axes smaller.
+    rows = math.ceil(len(handles) / columns)
+    figure.set_figheight(figure.get_figheight() + LEGEND_ROW * max(0, rows - 4))
     figure.legend(handles=handles, loc="outside lower center", ncols=columns)
 
 

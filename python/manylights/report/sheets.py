@@ -9,7 +9,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from manylights.report.charts import STYLE, save
+from manylights.report.charts import STYLE, plain, save
 from manylights.report.pictures import MapRow, Picture, ScenePictures
 from manylights.report.results import Scene
 
@@ -73,13 +73,13 @@ def _text_lines(row: list[Picture]) -> float:
 def _title(figure: Figure, scene: Scene) -> None:
     title = scene.title + (f", {scene.equal_time:g} s each" if scene.equal_time else "")
     height = figure.get_figheight()
-    figure.text(0.5, 1 - MARGIN / height, title, ha="center", va="top", fontsize=11)
+    figure.text(0.5, 1 - MARGIN / height, plain(title, 120), ha="center", va="top", fontsize=11)
 
 
 def _show(axes, picture: Picture) -> None:
     axes.set_axis_off()
     axes.imshow(picture.pixels, interpolation="none", aspect="auto")
-    axes.set_title(picture.label, fontsize=8, pad=3)
+    axes.set_title(plain(picture.label, 28), fontsize=8, pad=3)
     axes.annotate(
         "\n".join(picture.notes),
         (0.5, 0),
