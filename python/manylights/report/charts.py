@@ -141,7 +141,8 @@ def _overview(results: Results) -> Iterator[tuple]:
     scenes = [scene for scene in results.scenes if scene.series]
     if not scenes:
         return
-    columns = min(3, len(scenes))
+    # Four are a square, not a row of three and one
+    columns = 2 if len(scenes) == 4 else min(3, len(scenes))
     rows = math.ceil(len(scenes) / columns)
     figure = Figure(figsize=(max(WIDTH, 3.4 * columns), 2.7 * rows + 0.8), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
