@@ -60,6 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     from manylights import __version__
     from manylights.bench.cli import add_bench, add_compare
+    from manylights.report.cli import add_report
 
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -78,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_demo(commands, common)
     add_bench(commands, common)
     add_compare(commands, common)
+    add_report(commands, common)
     return parser
 
 

@@ -1,0 +1,106 @@
+"""Decides which series are shown together: lines of a chart, sweeps, families of scenes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+from manylights.report.results import Results, Scene, Series
+from manylights.report.statistics import cost
+
+#: Parameters that are swept, with what a series has that does not name them.
+SWEPT = {"splitting_rate": 1.0, "reservoirs": 8, "shadow_rays": 4}
+
+#: A sweep with fewer values is no curve.
+MIN_SWEEP = 3
+
+
+def label(series: Series, without: str = "") -> str:
+    """Name a series for people, leaving out the parameter ``without``."""
+    name = {"resampled_tree": "resampled_tree (ours)"}.get(series.method, series.method)
+    if series.method in ("uniform", "power"):
+        name = f"{series.method} (Mitsuba)"
+    settings = [f"{key} {value_text(value)}" for key, value in series.parameters.items()]
+    return ", ".join([name] + [text for text in settings if text.split()[0] != without])
+
+
+def value_text(value: Any) -> str:
+    """Write the value of a parameter; whole numbers without a point."""
+    return f"{value:g}" if isinstance(value, (int, float)) else str(value)
+
+
+def ours(scene: Scene) -> Series | None:
+    """The series that all peers are compared with: our method with the fewest parameters set."""
+    candidates = [series for series in scene.series if series.ours]
+    return min(candidates, key=lambda series: len(series.parameters), default=None)
+
+
+def best(candidates: list[Series], scene: Scene) -> Series:
+    """The series with the lowest error times time."""
+    return min(candidates, key=lambda series: cost(series, scene).value)
+
+
+def one_a_method(scene: Scene) -> list[Series]:
+    """Ours as it comes, and each peer with its best setting."""
+    methods = defaultdict(list)
+    for series in scene.series:
+        methods[series.method].append(series)
+    chosen = [best(group, scene) for group in methods.values() if not group[0].ours]
+    return [series for series in [ours(scene)] if series] + chosen
+
+
+def shown(scene: Scene) -> list[Series]:
+    """Series for the charts of one scene: of a sweep just the default, and a peer's best."""
+    groups = defaultdict(list)
+    for series in scene.series:
+        groups[_without(series, tuple(SWEPT))].append(series)
+    keep = one_a_method(scene)
+    for group in groups.values():
+        if not group[0].ours:
+            keep += [series for series in group if not set(series.parameters) & set(SWEPT)]
+    # A peer's best may be its default under another name: the longer name is left out.
+    distinct = {}
+    for series in sorted(keep, key=lambda series: len(series.parameters)):
+        distinct.setdefault(_without(series, ()), series)
+    order = list(dict.fromkeys(series.method for series in keep))
+    return sorted(distinct.values(), key=lambda series: order.index(series.method))
+
+
+def peers(scene: Scene) -> list[Series]:
+    """All series of other methods, sweeps included."""
+    return [series for series in scene.series if not series.ours]
+
+
+def sweeps(scene: Scene, parameter: str) -> list[list[tuple[Any, Series]]]:
+    """Series that differ in ``parameter`` only, as lists of (value, series) with rising values."""
+    groups = defaultdict(dict)
+    # A series that names the default comes later and replaces the one that does not.
+    for series in sorted(scene.series, key=lambda series: len(series.parameters)):
+        if series.method not in ("uniform", "power"):
+            value = series.parameters.get(parameter, SWEPT[parameter])
+            groups[_without(series, (parameter,))][float(value)] = (value, series)
+    long = [group for group in groups.values() if len(group) >= MIN_SWEEP]
+    return [[group[value] for value in sorted(group)] for group in long]
+
+
+def families(results: Results) -> dict[str, list[Scene]]:
+    """Scenes that differ in the number of lights only, by that number."""
+    groups = defaultdict(list)
+    for scene in results.scenes:
+        if scene.family:
+            groups[scene.family].append(scene)
+    return {
+        family: sorted(scenes, key=lambda scene: scene.lights)
+        for family, scenes in groups.items()
+        if len({scene.lights for scene in scenes}) > 1
+    }
+
+
+def _without(series: Series, names: tuple[str, ...]) -> tuple:
+    """What identifies a series apart from the parameters ``names``, and from defaults."""
+    left = {
+        key: str(value)
+        for key, value in series.parameters.items()
+        if key not in names and value != SWEPT.get(key)
+    }
+    return (series.method, *sorted(left.items()))

@@ -1,0 +1,191 @@
+"""Writes the page: all parts in one HTML file that needs no other and runs no script."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from manylights.errors import UsageError
+from manylights.report import charts, grouping, pictures, results, sheets, statistics, tables
+
+PAGE_NAME, CHART_FOLDER = "report.html", "charts"
+
+#: What the methods do, for readers of the page.
+METHODS = {
+    "resampled_tree": "ours with its default settings: equidistant points descend the tree, the "
+    "lights they find are resampled",
+    "talk": "the algorithm of the talk as published: stochastic splitting of a binary tree",
+    "adaptive_splitting": "deterministic splitting: a node is split where it looks large, so "
+    "neighbouring pixels can have different cuts of the tree",
+    "tree": "one light by a random descent of the tree",
+    "exhaustive": "every light at every point",
+    "uniform": "Mitsuba's own integrator, emitters chosen uniformly",
+    "power": "Mitsuba's own integrator, emitters chosen in proportion to their power",
+}
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Largest step between neighbouring columns of a boundary scene."""
+
+    scene: results.Scene
+    label: str
+    low: float
+    high: float
+    step: float
+
+
+def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, list[str]]:
+    """Write the page and the charts.
+
+    Args:
+        folder: what ``manylights bench`` wrote.
+        output: the page; None for report.html in ``folder``.
+        publish: leave out pictures and file names of private scenes.
+
+    Returns:
+        The page's path, and remarks on what was left out.
+    """
+    data = results.load(folder)
+    target = Path(output) if output else data.folder / PAGE_NAME
+    _check_target(target)
+    text, remarks = render(data, publish)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
+    return target, remarks
+
+
+def _check_target(target: Path) -> None:
+    """Refuse what cannot be written before the work starts."""
+    if not target.parent.is_dir():
+        raise UsageError(f"-o {target}: there is no folder {target.parent}")
+    if target.is_dir() or not os.access(target.parent, os.W_OK):
+        raise UsageError(f"-o {target}: not writable")
+
+
+def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
+    """Return the page's text and remarks; write the charts."""
+    remarks = list(data.remarks)
+    visible = _scene_pictures(data, publish, remarks)
+    deviations = {
+        scene: pictures.deviation_lines(scene, grouping.shown(scene), remarks)
+        for scene in data.scenes
+        if scene.boundary
+    }
+    folder = data.folder / CHART_FOLDER
+    drawn = charts.draw_all(data, deviations, folder)
+    sheets.write_sheets(visible, folder)
+    if publish:
+        sheets.remove_sheets([scene for scene in data.scenes if scene.private], folder)
+    losses = [row for row in tables.efficiencies(data, every=True) if row.lost]
+    compared = len(tables.efficiencies(data, every=True))
+    text = (
+        _environment()
+        .get_template("template.html")
+        .render(
+            results=data,
+            publish=publish,
+            remarks=remarks,
+            charts=drawn,
+            pictures=visible,
+            summaries=tables.summaries(data),
+            efficiencies=tables.efficiencies(data),
+            losses=losses,
+            compared=compared,
+            biases=tables.biases(data),
+            times=tables.times(data),
+            steps=_steps(deviations),
+            methods=_methods(data),
+            seeds=_seeds(data),
+            targets=charts.TARGETS,
+            clearly_above=statistics.CLEARLY_ABOVE,
+            private=any(scene.private for scene in data.scenes),
+        )
+    )
+    return text, remarks
+
+
+def _environment() -> jinja2.Environment:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=loader,
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters.update(
+        number=_number, ratio=_ratio, percent=_percent, svg=_svg_uri, count=lambda n: f"{n:,}"
+    )
+    return environment
+
+
+def _scene_pictures(data, publish: bool, remarks: list[str]) -> list[pictures.ScenePictures]:
+    found = []
+    for scene in data.scenes:
+        if scene.private and publish:
+            remarks.append(f"{scene.name}: private, its pictures are left out")
+            continue
+        made = pictures.scene_pictures(scene, data.metric["epsilon"], remarks)
+        if made:
+            found.append(made)
+    return found
+
+
+def _steps(deviations: charts.Deviations) -> list[Steps]:
+    return [
+        Steps(scene, grouping.label(series), line.min(), line.max(), pictures.largest_step(line))
+        for scene, lines in deviations.items()
+        for series, line in lines
+    ]
+
+
+def _methods(data) -> dict[str, str]:
+    """The measured methods in the order of charts, with what they do."""
+    measured = {series.method for scene in data.scenes for series in scene.series}
+    known = {method: text for method, text in METHODS.items() if method in measured}
+    return {**known, **{method: "" for method in sorted(measured - set(known))}}
+
+
+def _seeds(data) -> str:
+    """How many renders with different seeds a point has."""
+    counts = {
+        len(point.seconds)
+        for scene in data.scenes
+        for series in scene.series
+        for point in series.points
+    }
+    ends = sorted({min(counts, default=0), max(counts, default=0)})
+    return " to ".join(map(str, ends))
+
+
+def _number(value: Any) -> str:
+    """Write a number with three digits, without needless zeros in the exponent."""
+    if value is None or not np.isfinite(value):
+        return "n/a"
+    text = f"{value:,.0f}" if 1000 <= abs(value) < 1e7 else f"{value:.3g}"
+    return text.replace("e-0", "e-").replace("e+0", "e")
+
+
+def _ratio(interval: statistics.Interval) -> str:
+    if not interval.known:
+        return f"{_number(interval.value)} (one seed)"
+    return f"{_number(interval.value)} ({_number(interval.low)} to {_number(interval.high)})"
+
+
+def _percent(value: float) -> str:
+    sign = "-" if value < 0 else "+"
+    return "n/a" if not np.isfinite(value) else f"{sign}{_number(abs(100 * value))} %"
+
+
+def _svg_uri(chart: charts.Chart) -> str:
+    return pictures.data_uri("image/svg+xml", chart.svg)
