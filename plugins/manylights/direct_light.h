@@ -503,7 +503,8 @@ private:
         if (vertex.at.media) {
             bool segment = vertex.at.extent == Extent::Segment;
             auto from    = segment ? plain(sample.from) : vertex.at.p;
-            target *= attenuation(vertex.at, dr::norm(plain(sample.p) - from));
+            auto far     = attenuation(vertex.at, dr::norm(plain(sample.p) - from));
+            target = dr::select(target > 0.f, target * far, 0.f); // else p is undefined
         }
         return target;
     }

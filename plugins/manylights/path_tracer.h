@@ -104,8 +104,7 @@ private:
 
         BSDFPtr bsdf = bsdf_of(si, surface);
         Mask goes_on = ends_there && (!is_last(s) || can_pass(bsdf, ends_there));
-        if (m_media) // as in volpath; in path the last surface does not count
-            s.valid |= ends_there && !goes_on;
+        s.valid |= ends_there && !goes_on;
         s.active &= piece.scattered || goes_on;
         if (dr::none_or<false>(s.active))
             return;
