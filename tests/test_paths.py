@@ -197,6 +197,16 @@ def test_mean_with_early_russian_roulette(llvm, name, rr_depth):
     assert_unbiased(name, llvm, max_depth=9, rr_depth=rr_depth)
 
 
+@llvm_first
+@pytest.mark.parametrize("parameters", [*METHODS, *PARAMETERS], ids=parameter_id)
+@pytest.mark.parametrize("name", ["camera-inside", "smoke"])
+def test_every_setting_gives_numbers(variant, name, parameters):
+    """No setting divides by the nothing that an empty reservoir holds."""
+    integrator = light_tree(max_depth=3, **parameters)
+    image = mi.render(path_scenes.load(name), integrator=integrator, spp=8, seed=3)
+    tools.assert_finite(np.array(image), name)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, ids=parameter_id)
 @pytest.mark.parametrize("name", ["gallery", "fog", "smoke", "points-in-bubble"])
