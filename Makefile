@@ -45,10 +45,12 @@ test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many rend
 .PHONY: bench
 bench: $(INSTALLED)  ## Measure all methods on the standard scenes (an hour) into bench/
 	env -u HOME $(BIN)/manylights bench --standard --out bench $(ARGS)
+	$(BIN)/manylights report bench
 
 .PHONY: bench-quick
 bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
 	env -u HOME $(BIN)/manylights bench --quick --out bench-quick $(ARGS)
+	$(BIN)/manylights report bench-quick
 
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling

@@ -27,8 +27,8 @@ def standard() -> list[Job]:
     """Return the scenes of ``--standard``.
 
     Meshes store their emission in a texture, on which Mitsuba chooses points by radiance: the best
-    it can do. ``glossy_10k`` and ``one_light`` are scenes in which choosing lights well gains
-    little or nothing.
+    it can do. ``glossy_10k`` and the scenes with a single light are those in which choosing lights
+    well gains little or nothing.
     """
     path, fog = "integrator=path,max_depth=6", "max_depth=4"
     return [
@@ -43,6 +43,8 @@ def standard() -> list[Job]:
         _job("behind_wall", "Bright lights behind a wall", "behind_wall:1000"),
         _job("bright_far", "One bright light far away", "bright_far:1000"),
         _job("one_light", "A single point light", "open_plane:1"),
+        _job("one_light_path", "A single point light, paths", f"open_plane:1,{path}"),
+        _job("one_light_fog", "A single point light in fog", f"fog_open:1,{fog}"),
         _boundary(),
     ]
 
