@@ -202,7 +202,7 @@ def _machine() -> dict[str, Any]:
         "cores": _cores(text),
         "threads": dr.thread_count(),
         "memory_gib": _memory_gib(),
-        "system": platform.platform(),
+        "system": " ".join([platform.system(), platform.machine(), *platform.libc_ver()]).strip(),
     }
 
 
