@@ -315,7 +315,7 @@ def _light_counts(results: Results) -> Iterator[tuple]:
 
 
 def _lights(scenes: list[Scene]) -> Figure:
-    chosen = {scene: grouping.one_a_method(scene) for scene in scenes}
+    chosen = {scene: grouping.as_they_come(scene) for scene in scenes}
     methods = _ordered({series.method for group in chosen.values() for series in group})
     builds = any(series.build_seconds > 0 for group in chosen.values() for series in group)
     figure = Figure(figsize=(WIDTH, 7.6 if builds else 5.6), layout="constrained")

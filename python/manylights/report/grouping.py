@@ -49,6 +49,14 @@ def one_a_method(scene: Scene) -> list[Series]:
     return [series for series in [ours(scene)] if series] + chosen
 
 
+def as_they_come(scene: Scene) -> list[Series]:
+    """Each method with the fewest parameters set: the same setting in all scenes of a family."""
+    methods: dict[str, Series] = {}
+    for series in sorted(scene.series, key=lambda series: len(series.parameters)):
+        methods.setdefault(series.method, series)
+    return list(methods.values())
+
+
 def shown(scene: Scene) -> list[Series]:
     """Series for the charts of one scene: of a sweep just the default, and a peer's best."""
     groups = defaultdict(list)

@@ -239,8 +239,9 @@ def _count_maps(scene: Scene, chosen: list[Series], remarks: list[str]) -> list[
     """Maps of what our methods counted, for those whose file is there."""
     found = []
     for series in chosen:
-        # Mitsuba's own integrators count nothing.
-        if series.method not in ("uniform", "power"):
+        # Mitsuba's own integrators count nothing, and what looks at all lights counts them all:
+        # on its scale the others would look alike.
+        if series.method not in ("uniform", "power", "exhaustive"):
             name = f"{series.key}.maps.exr"
             if (scene.folder / name).exists():
                 found.append((series, _read(scene, name)))
