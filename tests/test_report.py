@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -519,3 +520,13 @@ def test_defects_are_seen(folder, tmp_path, defect, finding):
     assert findings[finding]
     with pytest.raises(AssertionError):
         assert_fine(findings)
+
+
+def test_numbers_alone_make_a_page(tmp_path):
+    """The published results of the standard scenes have no pictures."""
+    published = Path(__file__).parents[1] / "scenes" / "bench" / "results.json"
+    (tmp_path / "results.json").write_bytes(published.read_bytes())
+    written, remarks = page.write_report(str(tmp_path), None, publish=False)
+    assert written.is_file()
+    assert "city_1M: no folder, its pictures are left out" in remarks
+    assert (tmp_path / "charts" / "overview.svg").is_file()

@@ -80,13 +80,18 @@ class ScenePictures:
 def scene_pictures(scene: Scene, epsilon: float, remarks: list[str]) -> ScenePictures | None:
     """Make the pictures of a scene, None if no rendering at equal time was kept.
 
-    What is missing and not needed is told in ``remarks``.
+    What is missing and not needed is told in ``remarks``, and so is a folder that is missing as a
+    whole.
 
     Raises:
         UsageError: the reference or a rendering at equal time is missing or unreadable.
     """
     chosen = [series for series in grouping.shown(scene) if series.equal_time]
     if not chosen:
+        return None
+    if not scene.folder.is_dir():
+        # Results are also published as numbers alone.
+        remarks.append(f"{scene.name}: no folder, its pictures are left out")
         return None
     reference = read_image(scene, "reference.exr")
     images = [read_image(scene, f"{series.key}.exr") for series in chosen]
@@ -108,7 +113,7 @@ def deviation_lines(
 ) -> list[tuple[Series, np.ndarray]]:
     """Standard deviation of one sample by column, from the variance images that there are."""
     lines = []
-    for series in chosen:
+    for series in chosen if scene.folder.is_dir() else []:
         name = f"{series.key}.variance.exr"
         if (scene.folder / name).exists():
             lines.append((series, np.sqrt(read_image(scene, name).mean(axis=(0, 2)))))
