@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import drjit as dr
@@ -23,6 +24,14 @@ def require_variant(name):
     if name.startswith("cuda") and not has_backend(dr.JitBackend.CUDA):
         pytest.skip(f"{name} needs an NVIDIA driver and GPU")
     mi.set_variant(name)
+
+
+def heed_ctrl_c():
+    """In a new process (`preexec_fn`): SIGINT ends it, though the tests run in the background.
+
+    Shells start what ends in `&` with that signal ignored, and children inherit it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.fixture(params=VARIANTS)

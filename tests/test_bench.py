@@ -30,6 +30,8 @@ from manylights.cli import main
 from manylights.errors import UsageError
 from manylights.loading import has_backend
 
+from tests.conftest import heed_ctrl_c
+
 pytest.importorskip("flip_evaluator")
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -414,7 +416,10 @@ def test_ctrl_c_keeps_results_and_the_same_command_goes_on(tmp_path, variant):
     arguments = ["bench", CITY, "--methods", "uniform,power", "--spp", "1,2", "--out", out]
     command = [sys.executable, "-m", "manylights", *arguments, "--variant", variant]
     process = subprocess.Popen(
-        [*map(str, command), "--seeds", "100000"], stderr=subprocess.PIPE, start_new_session=True
+        [*map(str, command), "--seeds", "100000"],
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=heed_ctrl_c,
     )
     try:
         deadline = time.monotonic() + 240

@@ -17,6 +17,8 @@ from manylights.errors import UsageError
 from manylights.loading import has_backend
 from manylights.progress import Estimate, format_seconds
 
+from tests.conftest import heed_ctrl_c
+
 SCENES = Path(__file__).parent.parent / "scenes"
 
 DIRECT = """<scene version="3.0.0">
@@ -490,7 +492,11 @@ def test_ctrl_c_leaves_no_file(tmp_path, variant):
     command = [sys.executable, "-m", "manylights", "render", SCENES / "points.xml", "-o", out]
     command += ["--spp", "200000", "--variant", variant]
     process = subprocess.Popen(
-        list(map(str, command)), stderr=subprocess.PIPE, text=True, start_new_session=True
+        list(map(str, command)),
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=heed_ctrl_c,
     )
     try:
         # The last line before the render starts names the integrator.
