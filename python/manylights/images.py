@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import mitsuba as mi
 
-from manylights.errors import UsageError
+from manylights import files
 from manylights.threads import threads_for_files
 
 
@@ -17,14 +16,7 @@ def check_output(path: str) -> Path:
     Raises:
         UsageError: another ending, no such folder, a folder of that name, or no permission.
     """
-    target = Path(path)
-    if target.suffix.lower() != ".exr":
-        raise UsageError(f"-o {path}: the image is an OpenEXR file, end the name in .exr")
-    if not target.parent.is_dir():
-        raise UsageError(f"-o {path}: there is no folder {target.parent}")
-    if target.is_dir() or not os.access(target.parent, os.W_OK):
-        raise UsageError(f"-o {path}: not writable")
-    return target
+    return files.check_output(path, "the image is an OpenEXR file", ".exr")
 
 
 def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
@@ -58,11 +50,6 @@ def _preview(bitmap):
 
 def write_whole(bitmap, target: Path, file_format) -> Path:
     """Write ``bitmap`` to ``target``, under another name first, and return ``target``."""
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with threads_for_files():
-            bitmap.write(str(partial), file_format)
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with files.written_whole(target) as partial, threads_for_files():
+        bitmap.write(str(partial), file_format)
     return target

@@ -212,6 +212,7 @@ def _compare(options) -> int:
 
     import mitsuba as mi
 
+    from manylights import files
     from manylights.bench import compare, metrics
 
     mi.set_variant("scalar_rgb")
@@ -221,7 +222,9 @@ def _compare(options) -> int:
     for name, image in zip(names, images):
         compare.check_size(image, name, images[0], names[0])
     trim = metrics.TRIM if options.trim is None else options.trim
-    target = compare.check_picture(options.output) if options.output else None
+    target = None
+    if options.output:
+        target = files.check_output(options.output, "the picture is a PNG file", ".png")
     found, equal = compare.compare(*images, threshold=options.threshold, trim=trim)
     if target is not None:
         compare.write_picture(images[0], images[-1], target)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -59,22 +58,6 @@ def check_size(image: np.ndarray, name: str, first: np.ndarray, first_name: str)
     if image.shape != first.shape:
         size, wanted = (f"{shape[1]} x {shape[0]}" for shape in (image.shape, first.shape))
         raise UsageError(f"{name}: has {size} pixels, {first_name} has {wanted}")
-
-
-def check_picture(path: str) -> Path:
-    """Return ``path`` if a PNG file can be written there.
-
-    Raises:
-        UsageError: another ending, or a folder that is missing or not writable.
-    """
-    target = Path(path)
-    if target.suffix.lower() != ".png":
-        raise UsageError(f"-o {path}: the picture is a PNG file, end the name in .png")
-    if not target.parent.is_dir():
-        raise UsageError(f"-o {path}: there is no folder {target.parent}")
-    if target.is_dir() or not os.access(target.parent, os.W_OK):
-        raise UsageError(f"-o {path}: not writable")
-    return target
 
 
 def write_picture(image: np.ndarray, reference: np.ndarray, target: Path) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
+
+from manylights import files
 
 
 class Moments:
@@ -36,10 +37,8 @@ class Moments:
 
     def save(self, path: Path) -> None:
         """Write to an ``npz`` file, whole or not at all."""
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        with open(partial, "wb") as file:
+        with files.written_whole(path) as partial, open(partial, "wb") as file:
             np.savez(file, seeds=self.seeds, mean=self.mean, squares=self.squares)
-        os.replace(partial, path)
 
     @staticmethod
     def load(path: Path) -> Moments:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights import images
+from manylights import files, images
 from manylights.bench import metrics
 from manylights.bench.methods import Method
 from manylights.bench.scene_source import Source
@@ -45,10 +45,8 @@ class Results:
         """Write ``results.json``, whole or not at all."""
         scenes = [_without_empty_points(entry) for entry in self.data["scenes"]]
         text = json.dumps({**self.data, "scenes": scenes}, indent=1, allow_nan=False)
-        with self.writing:
-            partial = self.folder / f".{NAME}.{os.getpid()}.partial"
+        with self.writing, files.written_whole(self.folder / NAME) as partial:
             partial.write_text(text)
-            os.replace(partial, self.folder / NAME)
 
     def write_image(self, scene: str, name: str, pixels: np.ndarray, channels: list[str]) -> None:
         """Write ``SCENE/NAME.exr``, whole or not at all, in single precision."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights import files
 from manylights.report import charts, grouping, pictures, results, sheets, statistics, tables
 
 PAGE_NAME, CHART_FOLDER = "report.html", "charts"
@@ -52,24 +51,11 @@ def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, 
         The page's path, and remarks on what was left out.
     """
     data = results.load(folder)
-    target = Path(output) if output else data.folder / PAGE_NAME
-    _check_target(target)
+    target = files.check_output(output or str(data.folder / PAGE_NAME))
     text, remarks = render(data, publish)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
+    with files.written_whole(target) as partial:
         partial.write_text(text, encoding="utf-8")
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
     return target, remarks
-
-
-def _check_target(target: Path) -> None:
-    """Refuse what cannot be written before the work starts."""
-    if not target.parent.is_dir():
-        raise UsageError(f"-o {target}: there is no folder {target.parent}")
-    if target.is_dir() or not os.access(target.parent, os.W_OK):
-        raise UsageError(f"-o {target}: not writable")
 
 
 def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
@@ -86,8 +72,7 @@ def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
     sheets.write_sheets(visible, folder)
     if publish:
         sheets.remove_sheets([scene for scene in data.scenes if scene.private], folder)
-    losses = [row for row in tables.efficiencies(data, every=True) if row.lost]
-    compared = len(tables.efficiencies(data, every=True))
+    compared = tables.efficiencies(data, every=True)
     text = (
         _environment()
         .get_template("template.html")
@@ -99,8 +84,8 @@ def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
             pictures=visible,
             summaries=tables.summaries(data),
             efficiencies=tables.efficiencies(data),
-            losses=losses,
-            compared=compared,
+            losses=[row for row in compared if row.lost],
+            compared=len(compared),
             biases=tables.biases(data),
             times=tables.times(data),
             steps=_steps(deviations),
