@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
+from manylights.bench import metrics
 from manylights.errors import UsageError
 from manylights.report import charts, grouping, page, pictures, results, sheets, statistics, tables
 
@@ -222,7 +223,7 @@ def test_relative_error_is_that_of_bench():
     reference = np.full((2, 2, 3), 0.5)
     image = reference + np.array([0.1, 0.0, -0.2])
     expected = (0.01 + 0.04) / 3 / (0.25 + (0.05 * 0.5) ** 2)
-    error = pictures._relative_error(image, reference, 0.05)
+    error = metrics.relative_errors(image, reference, 0.05)
     np.testing.assert_allclose(error, expected)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import manylights
 import mitsuba as mi
 import numpy as np
+from manylights.bench import metrics
 
 mi.set_variant("llvm_ad_rgb")
 FOLDER = Path(__file__).parent
@@ -36,14 +37,6 @@ def render_time(scene: mi.Scene, integrator: mi.Integrator, spp: int) -> float:
         render(scene, integrator, spp, seed)
         seconds.append(time.perf_counter() - start)
     return float(np.median(seconds))
-
-
-def relative_error(image: np.ndarray, reference: np.ndarray) -> float:
-    """Mean of (x - r)^2 / (r^2 + (0.05 mean r)^2) over pixels, without the worst 0.1 %."""
-    error = np.mean((image - reference) ** 2, axis=2)
-    error /= np.mean(reference, axis=2) ** 2 + (0.05 * reference.mean()) ** 2
-    error = np.sort(error.ravel())
-    return float(error[: int(0.999 * error.size)].mean())
 
 
 def write(image: np.ndarray, name: str) -> None:
@@ -82,7 +75,7 @@ def render_pair(description: dict, theirs: dict, ours: dict, names: tuple, sampl
         write(image, f"{name}.jpg")
         print(
             f"{name}: {count} spp, {taken:.2f} s, "
-            f"relative mean squared error {relative_error(image, reference):.4f}"
+            f"relative mean squared error {metrics.relative_mse(image, reference, metrics.TRIM):.4f}"
         )
 
 

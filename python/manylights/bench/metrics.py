@@ -15,20 +15,22 @@ EPSILON = 0.05
 TRIM = 0.001
 
 
-def squared_scale(reference: np.ndarray) -> np.ndarray:
+def squared_scale(reference: np.ndarray, epsilon: float = EPSILON) -> np.ndarray:
     """Return what squared differences of each pixel are divided by, shape (height, width)."""
     reference = np.asarray(reference, dtype=float)
-    return reference.mean(axis=2) ** 2 + (EPSILON * reference.mean()) ** 2
+    return reference.mean(axis=2) ** 2 + (epsilon * reference.mean()) ** 2
 
 
-def relative_errors(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def relative_errors(
+    image: np.ndarray, reference: np.ndarray, epsilon: float = EPSILON
+) -> np.ndarray:
     """Return the relative squared error of each pixel, shape (height, width).
 
     It is the mean over the channels of (x - r)^2 / (r_bar^2 + (epsilon mean r)^2), where r_bar is
     the mean over the pixel's channels. Where both are zero in an all black reference it is zero.
     """
     difference = np.asarray(image, dtype=float) - np.asarray(reference, dtype=float)
-    return _divide(np.mean(difference**2, axis=2), squared_scale(reference))
+    return _divide(np.mean(difference**2, axis=2), squared_scale(reference, epsilon))
 
 
 def trimmed_mean(errors: np.ndarray, trim: float = TRIM) -> float:

@@ -18,7 +18,7 @@ MIN_SWEEP = 3
 def label(series: Series, without: str = "") -> str:
     """Name a series for people, leaving out the parameter ``without``."""
     name = {"resampled_tree": "resampled_tree (ours)"}.get(series.method, series.method)
-    if series.method in ("uniform", "power"):
+    if series.mitsubas:
         name = f"{series.method} (Mitsuba)"
     settings = [f"{key} {value_text(value)}" for key, value in series.parameters.items()]
     return ", ".join([name] + [text for text in settings if text.split()[0] != without])
@@ -84,7 +84,7 @@ def sweeps(scene: Scene, parameter: str) -> list[list[tuple[Any, Series]]]:
     groups = defaultdict(dict)
     # A series that names the default comes later and replaces the one that does not.
     for series in sorted(scene.series, key=lambda series: len(series.parameters)):
-        if series.method not in ("uniform", "power"):
+        if not series.mitsubas:
             value = series.parameters.get(parameter, SWEPT[parameter])
             groups[_without(series, (parameter,))][float(value)] = (value, series)
     long = [group for group in groups.values() if len(group) >= MIN_SWEEP]

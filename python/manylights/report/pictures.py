@@ -12,9 +12,11 @@ import matplotlib
 import matplotlib.image
 import numpy as np
 
+from manylights.bench import metrics
 from manylights.errors import UsageError, one_line
 from manylights.report import grouping
 from manylights.report.results import Scene, Series
+from manylights.threads import threads_for_files
 
 #: Share of the reference's pixels that the exposure leaves below white.
 BELOW_WHITE = 0.97
@@ -24,6 +26,8 @@ MAX_CROP = 96
 MAX_WIDTH = 480
 #: Colours of maps: lightness rises all the way, so they also work in grey.
 ERROR_COLORS, COUNT_COLORS = "inferno", "viridis"
+#: Largest error of a map.
+MAX_ERROR = 1e12
 #: Columns on each side over which a step of the standard deviation is measured.
 STEP_WIDTH = 3
 
@@ -151,7 +155,8 @@ def _read(scene: Scene, name: str) -> dict[str, np.ndarray]:
     if not path.exists():
         raise UsageError(f"{path}: no such file, though results.json says that it was rendered")
     try:
-        bitmap = mi.Bitmap(str(path))
+        with threads_for_files():
+            bitmap = mi.Bitmap(str(path))
     except Exception as error:
         raise UsageError(f"{path}: not readable: {one_line(error)}") from None
     data = np.array(bitmap).astype(np.float32)
@@ -211,7 +216,9 @@ def _numbers(series: Series) -> list[str]:
 
 
 def _error_maps(chosen, images, reference, epsilon: float) -> MapRow:
-    errors = [_shrink(_relative_error(image, reference, epsilon)) for image in images]
+    errors = [metrics.relative_errors(image, reference, epsilon) for image in images]
+    # Where the reference is black everywhere they are infinite.
+    errors = [_shrink(np.minimum(error, MAX_ERROR)) for error in errors]
     low, high = _decades(errors)
     pictures = []
     for series, error in zip(chosen, errors):
@@ -221,13 +228,6 @@ def _error_maps(chosen, images, reference, epsilon: float) -> MapRow:
         pictures.append(Picture(name, _colored(shade, ERROR_COLORS), alt, _numbers(series)[1:2]))
     title = "Relative squared error"
     return MapRow(title, low, high, True, ERROR_COLORS, pictures)
-
-
-def _relative_error(image: np.ndarray, reference: np.ndarray, epsilon: float) -> np.ndarray:
-    """Relative squared error of each pixel, as bench defines it."""
-    gray = reference.mean(axis=-1)
-    floor = (epsilon * reference.mean()) ** 2 or 1e-12
-    return ((image - reference) ** 2).mean(axis=-1) / (gray**2 + floor)
 
 
 def _decades(errors: list[np.ndarray]) -> tuple[float, float]:
@@ -246,7 +246,7 @@ def _count_maps(scene: Scene, chosen: list[Series], remarks: list[str]) -> list[
     for series in chosen:
         # Mitsuba's own integrators count nothing, and what looks at all lights counts them all:
         # on its scale the others would look alike.
-        if series.method not in ("uniform", "power", "exhaustive"):
+        if not series.mitsubas and series.method != "exhaustive":
             name = f"{series.key}.maps.exr"
             if (scene.folder / name).exists():
                 found.append((series, _read(scene, name)))

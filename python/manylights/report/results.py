@@ -123,6 +123,11 @@ class Series:
         """Whether this is the method that the others are compared with."""
         return self.method == "resampled_tree"
 
+    @property
+    def mitsubas(self) -> bool:
+        """Whether this is Mitsuba's own integrator, which has no parameters and no tree."""
+        return self.method in ("uniform", "power")
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
