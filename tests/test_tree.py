@@ -102,7 +102,7 @@ def draw(tree, at, expected, trials, seed=1):
     ]
 
 
-def draw_talk(tree, at, rate, trials, function, xi=None, seed=1):
+def draw_splitting(tree, at, rate, trials, function, xi=None, seed=1):
     """The same for stochastic splitting, with the given `xi` or a random one for each sample."""
     numbers = uniform(trials, seed) if xi is None else np.full(trials, xi)
     return [
@@ -282,7 +282,7 @@ def test_any_tree_and_receiver(shape, count, seed, decades, place, normal, trans
     xi=st.floats(0, 1, exclude_max=True, width=32),
     function=st.sampled_from(SPLIT_FUNCTIONS),
 )
-def test_any_tree_and_receiver_of_talk(shape, count, seed, place, normal, rate, xi, function):
+def test_any_tree_and_receiver_of_splitting(shape, count, seed, place, normal, rate, xi, function):
     """Given xi the candidates' number is fixed: it is the sum of all probabilities."""
     tree = make_tree(*lights_of_shape(shape, count, seed, 2))
     at = receiver(place, normal)
@@ -423,7 +423,7 @@ def test_sum_is_unbiased_in_extreme_scenes(lights):
 every_function = pytest.mark.parametrize("function", SPLIT_FUNCTIONS)
 
 
-def talk_probabilities(tree, at, rate, xi, function):
+def splitting_probabilities(tree, at, rate, xi, function):
     """Probabilities given xi, in double precision."""
     p = tree.splitting_probabilities(**at, rate=rate, xi=xi, split_function=function)
     return np.array(p, float)
@@ -431,23 +431,23 @@ def talk_probabilities(tree, at, rate, xi, function):
 
 @every_function
 @every_receiver
-def test_talk_frequencies_given_xi(at, function):
+def test_splitting_frequencies_given_xi(at, function):
     """Below the cut that xi makes, each light is chosen as often as its probability says."""
     tree = make_tree(*random_lights(100))
     for xi in (0.02, 0.3, 0.9):
-        exact = talk_probabilities(tree, at, 1.0, xi, function)
-        samples = draw_talk(tree, at, 1.0, TRIALS // 4, function, xi)
+        exact = splitting_probabilities(tree, at, 1.0, xi, function)
+        samples = draw_splitting(tree, at, 1.0, TRIALS // 4, function, xi)
         assert len({len(lights) for lights, _ in samples}) == 1
         counts = selection_counts(samples, 100)
         tools.assert_binomial(counts, TRIALS // 4, np.minimum(exact, 1))
 
 
 @pytest.mark.parametrize("function", STOCHASTIC)
-def test_planted_wrong_talk_frequencies_are_found(function):
+def test_planted_wrong_splitting_frequencies_are_found(function):
     """The probabilities of another xi do not describe the samples."""
     tree, at = make_tree(*random_lights(100)), RECEIVERS["below"]
-    exact = talk_probabilities(tree, at, 1.0, 0.3, function)
-    counts = selection_counts(draw_talk(tree, at, 1.0, TRIALS // 4, function, 0.02), 100)
+    exact = splitting_probabilities(tree, at, 1.0, 0.3, function)
+    counts = selection_counts(draw_splitting(tree, at, 1.0, TRIALS // 4, function, 0.02), 100)
     with pytest.raises(AssertionError, match="frequencies differ"):
         tools.assert_binomial(counts, TRIALS // 4, np.minimum(exact, 1))
 
@@ -455,8 +455,8 @@ def test_planted_wrong_talk_frequencies_are_found(function):
 def test_planted_wrong_frequencies_of_variance_are_found():
     """The probabilities of another rate do not describe the samples."""
     tree, at = make_tree(*random_lights(100)), RECEIVERS["below"]
-    exact = talk_probabilities(tree, at, 0.3, 0.5, "variance")
-    counts = selection_counts(draw_talk(tree, at, 1.0, TRIALS // 4, "variance"), 100)
+    exact = splitting_probabilities(tree, at, 0.3, 0.5, "variance")
+    counts = selection_counts(draw_splitting(tree, at, 1.0, TRIALS // 4, "variance"), 100)
     with pytest.raises(AssertionError, match="frequencies differ"):
         tools.assert_binomial(counts, TRIALS // 4, np.minimum(exact, 1))
 
@@ -465,23 +465,23 @@ def test_planted_wrong_frequencies_of_variance_are_found():
 def test_splitting_by_variance_is_deterministic(at):
     """The cut does not depend on the random number, and is the same in other units."""
     lights = random_lights(300)
-    exact = talk_probabilities(make_tree(*lights), at, 1.0, 0.0, "variance")
-    assert (talk_probabilities(make_tree(*lights), at, 1.0, 0.9, "variance") == exact).all()
+    exact = splitting_probabilities(make_tree(*lights), at, 1.0, 0.0, "variance")
+    assert (splitting_probabilities(make_tree(*lights), at, 1.0, 0.9, "variance") == exact).all()
     mean, flux, axis, variance = lights
     larger = make_tree(8 * mean, 4 * flux, axis, 64 * variance)
     moved = {**at, "p": (8 * np.asarray(at["p"])).astype(np.float32)}
     np.testing.assert_allclose(
-        talk_probabilities(larger, moved, 1.0, 0.0, "variance"), exact, rtol=1e-4
+        splitting_probabilities(larger, moved, 1.0, 0.0, "variance"), exact, rtol=1e-4
     )
 
 
 @every_function
 @every_receiver
-def test_talk_sum_is_unbiased(at, function):
+def test_splitting_sum_is_unbiased(at, function):
     """Over random xi the mean of sum f / p is the sum of f, and 2 % more would be found."""
     tree = make_tree(*random_lights(100))
-    values = random_values(talk_probabilities(tree, at, 0.0, 0.5, function))
-    sums = horvitz_thompson(draw_talk(tree, at, 1.0, TRIALS, function), values)
+    values = random_values(splitting_probabilities(tree, at, 0.0, 0.5, function))
+    sums = horvitz_thompson(draw_splitting(tree, at, 1.0, TRIALS, function), values)
     tools.assert_same_mean(sums, exact_sums(values))
     with pytest.raises(AssertionError, match="significance"):
         tools.assert_same_mean(1.02 * sums, exact_sums(values))
@@ -490,32 +490,32 @@ def test_talk_sum_is_unbiased(at, function):
 @every_function
 @every_receiver
 @pytest.mark.parametrize("xi", [0.0, 0.5, 1 - 2.0**-24])
-def test_talk_without_splitting_gives_one_candidate(at, xi, function):
+def test_splitting_without_splitting_gives_one_candidate(at, xi, function):
     """A splitting rate of zero is a single descent."""
     tree = make_tree(*random_lights(100))
-    for lights, _ in draw_talk(tree, at, 0.0, 20, function, xi):
+    for lights, _ in draw_splitting(tree, at, 0.0, 20, function, xi):
         assert len(lights) == 1
 
 
 @every_function
 @pytest.mark.parametrize("rate", [HUGE_RATE, math.inf])
-def test_talk_with_infinite_rate_gives_every_light(rate, function):
+def test_splitting_with_infinite_rate_gives_every_light(rate, function):
     """Each light once, with probability one, whatever xi."""
     tree = make_tree(*random_lights(100))
     for at, xi in itertools.product(RECEIVERS.values(), (0.0, 0.5, 1 - 2.0**-24)):
-        for lights, p in draw_talk(tree, at, rate, 5, function, xi):
+        for lights, p in draw_splitting(tree, at, rate, 5, function, xi):
             assert sorted(lights) == list(range(100))
             assert set(p) == {1.0}
 
 
 @every_function
 @every_receiver
-def test_talk_splits_less_for_larger_xi(at, function):
+def test_splitting_splits_less_for_larger_xi(at, function):
     """A smaller xi, or a larger rate, cuts the tree at the same depth or further down."""
     tree = make_tree(*random_lights(300))
 
     def finer(rate, xi):
-        return talk_probabilities(tree, at, rate, xi, function)
+        return splitting_probabilities(tree, at, rate, xi, function)
 
     slack = 1 + 8 * 64 * EPSILON
     for xi in (0.01, 0.1, 0.4, 0.8):
@@ -528,7 +528,7 @@ def test_unknown_split_function_is_refused():
     """The message names those that exist."""
     tree = make_tree(*random_lights(5))
     with pytest.raises(ValueError, match='"near", "far" or "variance"'):
-        draw_talk(tree, RECEIVERS["below"], 1.0, 1, "middle")
+        draw_splitting(tree, RECEIVERS["below"], 1.0, 1, "middle")
 
 
 # ----------------------------------------------------------------------------------------- builder

@@ -9,9 +9,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-
 #: Seconds between two looks at the state of the work.
 REFRESH = 0.1
 
@@ -105,6 +102,10 @@ def run_with_bar(
 
 
 def _show(title: str, estimate: Estimate, worker: threading.Thread) -> None:
+    # Commands without a bar start without it.
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),

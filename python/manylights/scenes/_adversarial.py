@@ -184,14 +184,11 @@ def cut_boundary(
     colors = np.array([build.WARM, build.WHITE, build.COOL])[cluster]
     intensity = (30.0 * weight / weight.sum())[:, None] * colors
     lights = [build.point(*item) for item in zip(position, intensity)]
-    to_world = build.mi.ScalarTransform4f().look_at(
-        origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]
-    )
     sensor = build.camera([0, 0, 4], [0, 0, 0], width=width, height=height, spp=spp, up=(0, 1, 0))
     del sensor["fov"]
     # The height scales, too: half a millimetre of floor from the first row to the last.
     narrow = build.mi.ScalarTransform4f().scale([8.0, 2.5e-4 * width / height, 1.0])
-    sensor.update(type="orthographic", to_world=to_world @ narrow)
+    sensor.update(type="orthographic", to_world=sensor["to_world"] @ narrow)
     floor = build.rectangle([-15, -15, 0], [30, 0, 0], [0, 30, 0], bsdf=build.diffuse(0.5))
     return build.scene(integrator, sensor, {"floor": floor, **build.numbered("light", lights)})
 
