@@ -220,7 +220,9 @@ private:
             return;
         Centroids left_centroids, right_centroids;
         uint32_t middle = tree.begin;
-        if (tree.count() > 2 && depth < kMaxCostDepth)
+        if (tree.count() == 2)
+            sort_pair(m_items[tree.begin], m_items[tree.begin + 1]);
+        else if (depth < kMaxCostDepth)
             middle = partition(tree, centroids, left_centroids, right_centroids);
         if (middle == tree.begin || middle == tree.end) {
             middle         = tree.begin + tree.count() / 2;
@@ -239,6 +241,17 @@ private:
             split(right, right_centroids, depth + 1);
         }
         m_nodes[tree.node] = { join(cluster(left), cluster(right)), middle };
+    }
+
+    /// Two lights lie in the order of their coordinates, whatever the input's order was
+    static void sort_pair(Item &a, Item &b) {
+        for (int axis = 0; axis < 3; ++axis) {
+            if (a.mean[axis] != b.mean[axis]) {
+                if (a.mean[axis] > b.mean[axis])
+                    std::swap(a, b);
+                return;
+            }
+        }
     }
 
     /// A plane between two bins: lights in bins below `bin` lie to its left
