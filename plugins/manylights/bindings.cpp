@@ -75,7 +75,7 @@ public:
             load(m_tree.binary.data(), m_tree.binary.size() * kBinaryNodeFloats);
         m_view.rows        = load(rows.data(), count * kRowFloats);
         m_view.light_count = (uint32_t) count;
-        m_view.oriented    = true;
+        m_view.directions  = Directions::Broad;
     }
 
     /// Probability that one random descent ends at each light

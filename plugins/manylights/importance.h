@@ -116,16 +116,45 @@ constexpr float kEmissionFloor = .05f;
 /// Rounds the corner of the smooth cosine, as a fraction of distance^2
 constexpr float kCosineRounding = 1e-6f;
 
-/// First harmonics of the emission in the direction -w / |w|
+/// What the lights' directions of emission allow, the same for the whole tree
+enum class Directions {
+    /// All lights shine in all directions
+    All,
+    /// The axis `a` is the mean normal: cosine lobes and wide spots
+    Broad,
+    /// The axis `a` is the mean direction of emission: there are narrow spots
+    Beams
+};
+
+/// Narrowest beam, as 1 / concentration: what the packed axis can tell
+constexpr float kNarrowestBeam = 1e-3f;
+
+/**
+ * Emission in the direction -w / |w|, where inv_norm is 1 / e, relative to its mean.
+ *
+ * Broad: first harmonics. Beams: a von Mises-Fisher lobe about the axis whose
+ * concentration k follows from the axis' length r (Banerjee et al. 2005) and from the
+ * angle that the cluster fills:
+ *
+ *     1 / k = (1 - r^2) / (r (3 - r^2)) + variance / e^2
+ *     2 k / (1 - exp(-2 k)) exp(k (o / r - 1))
+ */
 template <typename Float>
 Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
                      const Four<Float> &wy, const Four<Float> &wz,
-                     const Four<Float> &inv_norm) {
+                     const Four<Float> &inv_norm, Directions directions) {
     using F4 = Four<Float>;
     F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * inv_norm;
-    F4 k = dr::fmadd(c.axis[0], c.axis[0],
-                     dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
-    return dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - k), kEmissionFloor);
+    F4 r2 = dr::fmadd(c.axis[0], c.axis[0],
+                      dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+    if (directions == Directions::Broad)
+        return dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - r2), kEmissionFloor);
+    F4 inv_r = dr::rsqrt(r2 + 1e-8f),
+       spread =
+           (1.f - r2) * inv_r * dr::rcp(3.f - r2) + c.variance * dr::square(inv_norm),
+       k    = dr::rcp(dr::maximum(spread, kNarrowestBeam));
+    F4 peak = 2.f * k * dr::rcp(1.f - dr::exp(-2.f * k));
+    return dr::maximum(peak * dr::exp(k * (o * inv_r - 1.f)), kEmissionFloor);
 }
 
 /**
@@ -134,7 +163,7 @@ Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
  */
 template <typename Float>
 Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> &c,
-                               bool oriented) {
+                               Directions directions) {
     using F4 = Four<Float>;
     F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
     F4 along =
@@ -145,10 +174,10 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
     F4 t = view.closest(), off = along - t;
     F4 e          = dr::sqrt(dr::fmadd(off, off, dr::square(view.distance)));
     F4 importance = c.flux * view.angle() / view.distance * attenuation(at, F4(t + e));
-    if (oriented)
-        importance *= emission(c, F4(dr::fmadd(t, F4(at.wi.x()), wx)),
-                               F4(dr::fmadd(t, F4(at.wi.y()), wy)),
-                               F4(dr::fmadd(t, F4(at.wi.z()), wz)), F4(dr::rcp(e)));
+    if (directions != Directions::All)
+        importance *= emission(
+            c, F4(dr::fmadd(t, F4(at.wi.x()), wx)), F4(dr::fmadd(t, F4(at.wi.y()), wy)),
+            F4(dr::fmadd(t, F4(at.wi.z()), wz)), F4(dr::rcp(e)), directions);
     return importance;
 }
 
@@ -161,17 +190,17 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
  *     o = -a.w / e                                              a: mean emission axis
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
- * above it, and nothing ever becomes zero. Without `oriented` emitters the emission is 1.
+ * above it, and nothing ever becomes zero. The second factor is that of \ref emission.
  * In scenes with glossy surfaces h is multiplied with the receiver's \ref lobe. In a medium
  * there is no cosine, and h has the \ref attenuation. For segments see
  * \ref segment_importance.
  */
 template <typename Float>
 Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,
-                               bool oriented) {
+                               Directions directions) {
     using F4 = Four<Float>;
     if (at.extent == Extent::Segment)
-        return segment_importance(at, c, oriented);
+        return segment_importance(at, c, directions);
     F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
     F4 e2 = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
     F4 ie = dr::rsqrt(e2), ie2 = ie * ie;
@@ -191,11 +220,11 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
             dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
         importance *= lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2));
     }
-    if (oriented)
-        importance *= emission(c, wx, wy, wz, ie);
+    if (directions != Directions::All)
+        importance *= emission(c, wx, wy, wz, ie, directions);
     if (at.extent == Extent::Either)
-        importance =
-            dr::select(at.length > 0.f, segment_importance(at, c, oriented), importance);
+        importance = dr::select(at.length > 0.f, segment_importance(at, c, directions),
+                                importance);
     return importance;
 }
 
@@ -276,6 +305,12 @@ Float flat_intensity(const Vector3f &a, const Vector3f &w) {
     return dr::maximum(-dr::dot(a, w), 0.f) * dr::rsqrt(dr::squared_norm(w) + 1e-30f);
 }
 
+/// 0 if a light without extent is so near that what arrives is infinite: it is left out
+/// (emission.h) and must not push others out of their reservoirs
+template <typename Float, typename Vector3f> Float can_shine(const Vector3f &w) {
+    return dr::select(dr::isfinite(dr::rcp(dr::squared_norm(w))), Float(1.f), 0.f);
+}
+
 template <typename Float>
 Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
                              LightKind kind) {
@@ -285,12 +320,13 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
     float least = at.extent == Extent::Segment ? .05f : 0.f;
     switch (kind) {
         case LightKind::Point:
-            return { origin, Float(0.f), Float(1.f) };
+            return { origin, Float(0.f), can_shine<Float>(origin) };
         case LightKind::Spot: {
             Float cos_theta =
                 -dr::dot(row.vector(3), origin) * dr::rsqrt(dr::squared_norm(origin));
             return { origin, Float(0.f),
-                     dr::maximum(spot_falloff(row, cos_theta), least) };
+                     dr::maximum(spot_falloff(row, cos_theta), least) *
+                         can_shine<Float>(origin) };
         }
         case LightKind::Triangle: {
             Vector3f e1 = row.vector(3), e2 = row.vector(6), a = .5f * dr::cross(e1, e2),

@@ -47,7 +47,12 @@ template <typename Float, typename Spectrum> struct HostTable {
     bool needs_emitter_eval = false;
     /// Can a ray hit any light?
     bool can_be_hit = false;
+    /// Are there narrow spots? The axes of all bounds are then mean directions of emission
+    bool beams = false;
 };
+
+/// Spots up to this angle are narrow: wider ones resemble a cosine
+constexpr float kWidestBeam = .5f;
 
 template <typename Float, typename Spectrum> class LightTableReader {
 public:
@@ -59,12 +64,21 @@ public:
         LightTableReader reader;
         reader.m_scene       = scene;
         const auto &emitters = scene->emitters();
+        for (const auto &emitter : emitters)
+            reader.m_table.beams |= is_beam(emitter.get());
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
         return std::move(reader.m_table);
     }
 
 private:
+    static bool is_beam(const Emitter *emitter) {
+        if (emitter->class_name() != "SpotLight")
+            return false;
+        const Float *cutoff = ParameterReader(emitter).find<Float>("cutoff_angle");
+        return cutoff && dr::deg_to_rad(read_scalar(*cutoff)) < kWidestBeam;
+    }
+
     void add(const Emitter *emitter, uint32_t index) {
         m_emitter    = index;
         bool surface = has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface);
@@ -130,14 +144,20 @@ private:
         row.geometry[7] = cutoff > beam ? std::min(1.f / (cutoff - beam), 1e10f) : 1e10f;
 
         LightBounds bounds = point_bounds(row.geometry);
-        std::copy_n(row.geometry + 3, 3, bounds.axis);
-        // sqrt(flux * 4 pi * peak), see LightBounds
+        // Uniform up to the middle of the transition
+        float axis_length =
+            m_table.beams ? .5f + .5f * std::cos(.5f * (std::min(beam, cutoff) + cutoff))
+                          : 1.f;
+        for (int i = 0; i < 3; ++i)
+            bounds.axis[i] = axis_length * row.geometry[3 + i];
         // (1 - cos) as 2 sin^2, without cancellation
         float sin_beam   = std::sin(.5f * std::min(beam, cutoff)),
               sin_cutoff = std::sin(.5f * cutoff);
         float flux       = 2 * dr::Pi<float> * e.luminance *
                            (sin_beam * sin_beam + sin_cutoff * sin_cutoff);
-        bounds.flux      = std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
+        // sqrt(flux * 4 pi * peak), see LightBounds
+        bounds.flux =
+            m_table.beams ? flux : std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
         add_light(row, bounds);
     }
 
@@ -503,12 +523,13 @@ private:
     }
 
     /// Set the emission axis to the direction of u x v; returns its length
-    static float set_axis(LightBounds &bounds, const float u[3], const float v[3]) {
+    float set_axis(LightBounds &bounds, const float u[3], const float v[3]) const {
         float n[3]   = { u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
                          u[0] * v[1] - u[1] * v[0] };
         float length = std::hypot(n[0], n[1], n[2]);
+        float scale  = m_table.beams ? 2.f / 3.f : 1.f; // mean cosine of a cosine lobe
         for (int i = 0; i < 3; ++i)
-            bounds.axis[i] = length > 0 ? n[i] / length : 0;
+            bounds.axis[i] = length > 0 ? scale * n[i] / length : 0;
         return length;
     }
 

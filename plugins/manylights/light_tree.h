@@ -31,8 +31,7 @@ template <typename Float> struct TreeView {
     Storage nodes, binary, rows;
     uint32_t light_count = 0;
     KindSet kinds;
-    /// Does any light have a direction of emission?
-    bool oriented = false;
+    Directions directions = Directions::All;
 
     /// Gather the `Count` floats of entry `index`
     template <size_t Count>
@@ -87,7 +86,7 @@ private:
             clusters.mean[i] = four(4 * i);
         clusters.variance = four(12);
         clusters.flux     = four(16);
-        if (tree.oriented) {
+        if (tree.directions != Directions::All) {
             I4 axis = dr::reinterpret_array<I4>(four(20));
             for (int i = 0; i < 3; ++i) // signed 10-bit fields
                 clusters.axis[i] =
@@ -107,7 +106,7 @@ template <typename Float>
 dr::Array<Float, 4> child_probabilities(const TreeView<Float> &tree,
                                         const Receiver<Float> &at,
                                         const Clusters<Float> &clusters) {
-    Four<Float> h  = cluster_importance(at, clusters, tree.oriented);
+    Four<Float> h  = cluster_importance(at, clusters, tree.directions);
     Float sum_h    = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     Float sum_flux = (clusters.flux.entry(0) + clusters.flux.entry(1)) +
                      (clusters.flux.entry(2) + clusters.flux.entry(3));

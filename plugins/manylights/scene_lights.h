@@ -151,9 +151,7 @@ public:
         m_can_be_hit         = table.can_be_hit;
         for (const LightRow &row : rows)
             m_tree.kinds.insert((LightKind) (row.tag & kTagKindMask));
-        for (const LightBounds &bounds : table.bounds)
-            m_tree.oriented |=
-                bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0;
+        m_tree.directions = directions(table);
         for (const auto &shape : scene->shapes())
             m_glossy |= shape->bsdf() &&
                         has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy);
@@ -239,6 +237,15 @@ private:
     using Storage = typename Tree::Storage;
     using IndexStorage =
         std::conditional_t<dr::is_jit_v<Float>, UInt32D, dr::DynamicArray<UInt32D>>;
+
+    static Directions directions(const Table &table) {
+        if (table.beams)
+            return Directions::Beams;
+        for (const LightBounds &bounds : table.bounds)
+            if (bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0)
+                return Directions::Broad;
+        return Directions::All;
+    }
 
     static std::vector<LightRow> ordered_rows(const Table &table, const LightTree &tree) {
         std::vector<LightRow> rows(table.rows.size());
