@@ -153,12 +153,12 @@ def interrupt(monkeypatch, run):
     return render
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_killed_renders_go_on_to_the_same_bits(tmp_path, variant):
+@pytest.mark.parametrize(("variant", "spp"), [("scalar_rgb", 120), ("llvm_ad_rgb", 200)])
+def test_killed_renders_go_on_to_the_same_bits(tmp_path, variant, spp):
     """Killed, interrupted by Ctrl-C, and killed again, each time somewhere after a checkpoint."""
     require_variant(variant)
     delays = random.Random(8)
-    arguments = (SCENES / "points.xml", tmp_path / "out.exr", "--variant", variant, "--spp", 200)
+    arguments = (SCENES / "points.xml", tmp_path / "out.exr", "--variant", variant, "--spp", spp)
     arguments += ("-D", "resx=96", "-D", "resy=64")
     kept = tmp_path / "out.checkpoint.exr"
     for number, kind in enumerate((signal.SIGKILL, signal.SIGINT, signal.SIGKILL)):
@@ -462,6 +462,23 @@ def test_infinite_and_undefined_channels_stay_so():
     for values in ([1.0, np.inf, 1.0, 3e38], [1.0, 2.0, np.nan, 3e38], [1.0, 2.0, 1.0, 3e38]):
         sums.add(np.array([[values]], np.float32))
     np.testing.assert_array_equal(sums.high, [[[3.0, np.inf, np.nan, np.inf]]])
+
+
+@pytest.mark.parametrize(
+    ("variant", "width", "height", "size"),
+    [
+        ("scalar_rgb", 640, 360, 16),
+        ("scalar_rgb", 1920, 1080, 4),
+        ("scalar_rgb", 3840, 2160, 4),
+        ("llvm_ad_rgb", 640, 360, 64),
+        ("llvm_ad_rgb", 3840, 2160, 2),
+    ],
+)
+def test_passes_are_short_and_stratify(variant, width, height, size):
+    """Four million samples, or four per pixel; in JIT variants what the memory bounds."""
+    require_variant(variant)
+    film = mi.load_dict({"type": "hdrfilm", "width": width, "height": height})
+    assert rendering.checkpointed_sizes(film, 1000)[0] == size
 
 
 @pytest.mark.parametrize("pixels", [1024 * 1024, 1024 * 768, 1920 * 1080])

@@ -33,9 +33,8 @@ written. After a crash, a kill or Ctrl-C the same command goes on from there, an
 the image is the same, bit for bit, as without the interruption. The file is
 removed when the image is written. One of another job, of a changed scene or of
 another version is refused. In JIT variants the image is also the same as without
---checkpoint. Scalar variants render in passes then, of at most 8 million
-samples: the image has other noise, and stratified samplers, which stratify
-within a pass, leave a little more of it.
+--checkpoint. Scalar variants render in passes then, of at most 4 million samples
+or 4 samples per pixel: the image has other noise than without.
 """
 
 DEMO_HELP = """\

@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 #: (16 bytes and more for each sample) and the wait for the next step of the bar.
 MAX_SAMPLES_PER_PASS = 2**24
 
-#: The same in scalar variants, where a sample takes a few times as long.
-MAX_SAMPLES_PER_SCALAR_PASS = 2**23
+#: The same in scalar variants, where they take ten seconds to a minute on two cores. Where that is
+#: too little for samplers to stratify, passes have a few samples per pixel.
+MAX_SAMPLES_PER_SCALAR_PASS, MIN_SCALAR_SPP = 2**22, 4
 
 #: Renders up to this many samples take seconds and are one pass, the same as ``mi.render``.
 SINGLE_PASS_SAMPLES = 2**22
@@ -94,8 +95,10 @@ def pass_sizes(spp: int, pixels: int, most: int = MAX_SAMPLES_PER_PASS) -> list[
 
 def checkpointed_sizes(film, spp: int) -> list[int]:
     """Return the samples per pixel of each pass of a render that keeps checkpoints."""
-    most = MAX_SAMPLES_PER_SCALAR_PASS if _is_scalar() else MAX_SAMPLES_PER_PASS
-    return pass_sizes(spp, int(np.prod(film.crop_size())), most)
+    pixels, most = int(np.prod(film.crop_size())), MAX_SAMPLES_PER_PASS
+    if _is_scalar():
+        most = max(MAX_SAMPLES_PER_SCALAR_PASS, MIN_SCALAR_SPP * pixels)
+    return pass_sizes(spp, pixels, most)
 
 
 def pass_seed(seed: int, index: int) -> int:
