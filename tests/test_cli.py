@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import __version__, integrators, loading, rendering
+from manylights import __version__, cli, integrators, loading, rendering
 from manylights.errors import UsageError
 from manylights.loading import has_backend
 from manylights.progress import Estimate, format_seconds
@@ -413,9 +414,121 @@ def test_unknown_sensor(scene, tmp_path):
     assert_fails(process, "--sensor 4")
 
 
-@pytest.mark.parametrize("name", ["missing/out.exr", "out.png"])
-def test_output_that_cannot_be_written(scene, tmp_path, name):
-    assert_fails(manylights("render", scene, "-o", tmp_path / name), name)
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("missing/out.exr", "there is no folder"),
+        ("scene.xml/out.exr", "there is no folder"),
+        ("taken.exr", "it is a folder"),
+        ("out.png", "end the name in .exr"),
+    ],
+)
+def test_output_that_cannot_be_written_is_refused_before_the_render(scene, tmp_path, name, reason):
+    (tmp_path / "taken.exr").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    process = manylights("render", scene, "-o", tmp_path / name)
+    assert_fails(process, name, reason)
+    assert len(process.stderr.splitlines()) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_folder_that_takes_no_files_is_refused_before_the_render(scene):
+    """Also where permissions bind nobody, as they do not bind root."""
+    if not Path("/proc").is_dir():
+        pytest.skip("no /proc")
+    process = manylights("render", scene, "-o", "/proc/out.exr")
+    assert_fails(process, "-o /proc/out.exr: not writable (")
+    assert len(process.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("missing", [1, 100, 1000])
+def test_full_disk_leaves_nothing_half_written(scene, tmp_path, missing):
+    """The limit of a file's size stands for the disk.
+
+    With 33 lines the last one is a chunk of its own. Mitsuba's file stream buffers that, and does
+    not tell if there is no room for it in the end.
+    """
+    scene.write_text(
+        scene.read_text().replace('name="height" value="16"', 'name="height" value="33"')
+    )
+    render(scene, tmp_path / "out.exr")
+    size = (tmp_path / "out.exr").stat().st_size - missing
+    for name in ("out.exr", "out.png"):
+        (tmp_path / name).write_bytes(b"of an earlier render")
+    command = ("render", scene, "-o", tmp_path / "out.exr", "--variant", "scalar_rgb", "--spp", 4)
+    limit = (resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    process = manylights(*command, preexec_fn=lambda: resource.setrlimit(*limit))
+    assert_fails(process, f"{tmp_path / 'out.exr'}: not written (File too large)")
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "out.exr", "out.png"}
+    for name in ("out.exr", "out.png"):
+        assert (tmp_path / name).read_bytes() == b"of an earlier render"
+
+
+#: Files that a scene refers to, and the scene's element.
+REFERENCES = {
+    "bulbs.ply": '<shape type="ply"><string name="filename" value="{}"/></shape>',
+    "octahedron.obj": '<shape type="obj"><string name="filename" value="{}"/></shape>',
+    "dusk.exr": '<emitter type="envmap"><string name="filename" value="{}"/></emitter>',
+    "slide.png": '<texture type="bitmap"><string name="filename" value="{}"/></texture>',
+    "torus.vol": '<volume type="gridvolume"><string name="filename" value="{}"/></volume>',
+    "other.xml": '<include filename="{}"/>',
+}
+
+
+def referring(folder, name):
+    """A scene in `folder` that refers to the file of this name beside it."""
+    path = folder / "scene.xml"
+    element = REFERENCES[name].format(name)
+    path.write_text(DIRECT.replace("</scene>", f"{element}</scene>"))
+    return path
+
+
+def fail_to_render(capsys, scene):
+    """Render in this process; return the last line after checking that it says what failed."""
+    out = scene.with_name("out.exr")
+    command = ["render", str(scene), "-o", str(out), "--variant", "scalar_rgb"]
+    assert cli.main(command) == 2
+    assert not out.exists()
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_missing_file_of_a_scene_is_named(capsys, tmp_path, name):
+    line = fail_to_render(capsys, referring(tmp_path, name))
+    assert line.startswith("manylights: ") and name in line and "scene.xml" in line
+
+
+@pytest.mark.parametrize("part", [0.0, 0.01, 0.3, 0.7])
+@pytest.mark.parametrize("name", ["bulbs.ply", "slide.png", "torus.vol"])
+def test_truncated_file_of_a_scene_is_named(capsys, tmp_path, name, part):
+    data = (SCENES / "data" / name).read_bytes()
+    (tmp_path / name).write_bytes(data[: int(part * len(data))])
+    line = fail_to_render(capsys, referring(tmp_path, name))
+    assert line.startswith("manylights: ") and name in line
+
+
+@pytest.mark.parametrize("part", [0.0, 0.01, 0.7])
+def test_truncated_openexr_file_does_not_end_the_process(tmp_path, part):
+    """Several files: which threads read them is left to chance."""
+    data = (SCENES / "data" / "glow.exr").read_bytes()
+    shapes = ""
+    for index in range(8):
+        (tmp_path / f"{index}.exr").write_bytes(data[: int(part * len(data))])
+        shapes += f"""<shape type="sphere"><bsdf type="diffuse">
+            <texture type="bitmap" name="reflectance">
+                <string name="filename" value="{index}.exr"/>
+            </texture></bsdf></shape>"""
+    path = tmp_path / "scene.xml"
+    path.write_text(DIRECT.replace("</scene>", f"{shapes}</scene>"))
+    for command in (("render", path, "-o", tmp_path / "out.exr"), ("tree", path)):
+        assert_fails(manylights(*command, "--variant", "scalar_rgb"), ".exr: not a whole image")
+
+
+@pytest.mark.parametrize("text", ["", DIRECT[:200], DIRECT[:-10], "\0\1\2", "<scene", "a scene"])
+def test_scene_file_that_is_no_xml_is_named(capsys, tmp_path, text):
+    path = tmp_path / "broken.xml"
+    path.write_text(text)
+    assert str(path) in fail_to_render(capsys, path)
 
 
 def test_debug_shows_the_traceback(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import glob
 import os
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,9 +27,14 @@ def check_output(path: str, kind: str = "", ending: str = "") -> Path:
         raise UsageError(f"-o {path}: {kind}, end the name in {ending}")
     if not target.parent.is_dir():
         raise UsageError(f"-o {path}: there is no folder {target.parent}")
-    if target.is_dir() or not os.access(target.parent, os.W_OK):
-        raise UsageError(f"-o {path}: not writable")
-    return target
+    if target.is_dir():
+        raise UsageError(f"-o {path}: not writable, it is a folder")
+    # Permissions do not tell: nothing binds root, and not all that root may is possible.
+    try:
+        with tempfile.TemporaryFile(dir=target.parent):
+            return target
+    except OSError as error:
+        raise UsageError(f"-o {path}: not writable ({error.strerror})") from error
 
 
 @contextmanager
@@ -35,10 +42,44 @@ def written_whole(target: Path):
     """Context that yields another name to write to; at the end the file gets its own name.
 
     If the writing fails nothing is left, and a file that was there before stays.
+
+    Raises:
+        UsageError: the system does not write; the text has its reason.
     """
+    remove_leftovers(target)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         yield partial
+        _flush(partial)
         os.replace(partial, target)
+    except OSError as error:
+        raise UsageError(f"{target}: not written ({error.strerror})") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def remove_leftovers(target: Path) -> None:
+    """Remove what processes that were killed while they wrote ``target`` have left."""
+    for path in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        process = path.name.split(".")[-2]
+        if process.isdigit() and not _is_running(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _flush(path: Path) -> None:
+    """Have the system write the file now: after a power cut its name must not stand for less."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

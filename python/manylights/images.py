@@ -49,7 +49,13 @@ def _preview(bitmap):
 
 
 def write_whole(bitmap, target: Path, file_format) -> Path:
-    """Write ``bitmap`` to ``target``, under another name first, and return ``target``."""
-    with files.written_whole(target) as partial, threads_for_files():
-        bitmap.write(str(partial), file_format)
+    """Write ``bitmap`` to ``target``, under another name first, and return ``target``.
+
+    Mitsuba writes to memory: it does not look whether the end of a file reaches the disk.
+    """
+    stream = mi.MemoryStream()
+    with threads_for_files():
+        bitmap.write(stream, file_format)
+    with files.written_whole(target) as partial:
+        partial.write_bytes(stream.raw_buffer())
     return target

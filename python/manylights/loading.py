@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 
 from manylights import integrators
-from manylights.errors import UsageError
+from manylights.errors import UsageError, one_line
 from manylights.threads import threads_for_files
 
 
 @dataclass
 class LoadedScene:
-    """A scene, how many integrators it nests, and what was said about choosing them."""
+    """A scene and what is known about it.
+
+    Attributes:
+        scene: Mitsuba's.
+        integrator_count: how many integrators it nests.
+        notes: what was said about choosing them.
+        files: what it was read from, the scene file first.
+    """
 
     scene: object
     integrator_count: int
     notes: list[str]
+    files: list[Path] = field(default_factory=list)
 
 
 OLDEST_LLVM = 17
@@ -78,12 +87,27 @@ def parse(path: str, defines: dict[str, str]):
     return config, state
 
 
+def files_of(state) -> list[Path]:
+    """Return the XML files of a parsed scene and the files that it refers to.
+
+    Inside of ``search_beside``: Mitsuba looks for them as it will when it makes the scene.
+    """
+    files = [Path(str(file)) for file in state.files]
+    for node in state.nodes:
+        texts = [value for _, value in node.props.items() if isinstance(value, str)]
+        found = [str(mi.file_resolver().resolve(text)) for text in texts]
+        files += [Path(file) for file in found if os.path.isfile(file)]
+    return files
+
+
 def instantiate(config, state):
-    """Make Mitsuba's objects of a parsed scene.
+    """Make Mitsuba's objects of a parsed scene, inside of ``search_beside``.
 
     Raises:
-        UsageError: the file describes something that is not a scene.
+        UsageError: the file describes something that is not a scene, or an image is not whole.
+        RuntimeError: Mitsuba cannot make something.
     """
+    _check_images(files_of(state))
     mi.parser.transform_resolve(config, state)
     if config.merge_equivalent:
         mi.parser.transform_merge_equivalent(config, state)
@@ -93,6 +117,20 @@ def instantiate(config, state):
     if not isinstance(scene, mi.Scene):
         raise UsageError("the file holds no <scene>")
     return scene
+
+
+def _check_images(files: list[Path]) -> None:
+    """Read all OpenEXR files once.
+
+    Where they cannot be read Mitsuba 3.9 ends the process, without an exception, if it happens to
+    read them in a thread of the pool that makes the scene.
+    """
+    for file in dict.fromkeys(files):
+        if file.suffix.lower() == ".exr":
+            try:
+                mi.Bitmap(str(file))
+            except RuntimeError as error:
+                raise UsageError(f"{file}: not a whole image ({one_line(error)})") from error
 
 
 class search_beside:
@@ -128,7 +166,8 @@ def load(
     """
     with search_beside(path), threads_for_files():
         config, state = parse(path, defines or {})
+        files = files_of(state)
         notes = integrators.choose(state, integrator, settings or {})
         integrators.fix_block_size(state)
         count = sum(node.type == mi.ObjectType.Integrator for node in state.nodes)
-        return LoadedScene(instantiate(config, state), max(count, 1), notes)
+        return LoadedScene(instantiate(config, state), max(count, 1), notes, files)

@@ -21,11 +21,15 @@ class Estimate:
 
     Work done in few large passes reports rarely. Between reports the estimate advances at the mean
     speed so far, but never beyond the next report.
+
+    Args:
+        clock: returns the time in seconds.
+        begin: the fraction that was finished before, by an earlier process.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.clock, self.start = clock, clock()
-        self.last, self.step, self.reported_at = 0.0, 0.0, self.start
+    def __init__(self, clock: Callable[[], float] = time.monotonic, begin: float = 0.0) -> None:
+        self.clock, self.start, self.begin = clock, clock(), begin
+        self.last, self.step, self.reported_at = begin, 0.0, self.start
 
     def report(self, fraction: float) -> None:
         """Take note that ``fraction`` of the work, from 0 to 1, is done now."""
@@ -35,18 +39,17 @@ class Estimate:
 
     def fraction(self) -> float:
         """Return the estimated finished fraction, from 0 to 1."""
-        if self.last == 0.0:
-            return 0.0
-        speed = self.last / max(self.reported_at - self.start, 1e-6)
-        ahead = min(speed * (self.clock() - self.reported_at), self.step)
+        ahead = min(self._speed() * (self.clock() - self.reported_at), self.step)
         return min(self.last + ahead, 1.0)
 
     def seconds_left(self) -> float | None:
         """Return the estimated seconds to the end, None before the first report."""
-        if self.last == 0.0:
+        if self.last == self.begin:
             return None
-        speed = self.last / max(self.reported_at - self.start, 1e-6)
-        return (1.0 - self.fraction()) / speed
+        return (1.0 - self.fraction()) / self._speed()
+
+    def _speed(self) -> float:
+        return (self.last - self.begin) / max(self.reported_at - self.start, 1e-6)
 
 
 def format_seconds(seconds: float | None) -> str:
@@ -67,7 +70,8 @@ def run_with_bar(
     title: str,
     work: Callable[[Callable[[float], None]], Any],
     writing: threading.RLock | None = None,
-    farewell: str = "interrupted, nothing written",
+    farewell: Callable[[], str] = lambda: "interrupted, nothing written",
+    begin: float = 0.0,
 ) -> Any:
     """Run ``work(report)`` with a progress bar on stderr and return its result.
 
@@ -79,9 +83,10 @@ def run_with_bar(
         title: what the bar is labelled with.
         work: is given the function that takes the finished fraction, from 0 to 1.
         writing: held by the work while it writes a file: Ctrl-C waits for it. Default: no lock.
-        farewell: printed after Ctrl-C.
+        farewell: returns what to print after Ctrl-C.
+        begin: the fraction that was finished before, from 0 to 1.
     """
-    estimate = Estimate()
+    estimate = Estimate(begin=begin)
     outcome: dict[str, Any] = {}
 
     def run() -> None:
@@ -122,8 +127,8 @@ def _show(title: str, estimate: Estimate, worker: threading.Thread) -> None:
         bar.update(task, completed=1.0, left=format_seconds(0.0))
 
 
-def _end_interrupted(writing: threading.RLock | None, farewell: str) -> None:
+def _end_interrupted(writing: threading.RLock | None, farewell: Callable[[], str]) -> None:
     if writing is not None:
         writing.acquire()
-    say(farewell)
+    say(farewell())
     os._exit(INTERRUPTED)

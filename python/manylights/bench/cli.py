@@ -75,7 +75,7 @@ def add_bench(commands, common) -> None:
     )
     bench.add_argument(
         "--time-budget",
-        type=_seconds,
+        type=seconds,
         metavar="SECONDS",
         help="of one render (default: 0.5, with --quick 0.15)",
     )
@@ -152,7 +152,7 @@ def _bench(options) -> None:
         "measuring",
         lambda report: runner.run(jobs, settings, found, report),
         found.writing,
-        f"interrupted, what was measured is in {found.folder}; the same command goes on",
+        lambda: f"interrupted, what was measured is in {found.folder}; the same command goes on",
     )
     say(f"wrote {found.folder / results.NAME}")
 
@@ -255,7 +255,7 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
     value = _number(text)
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: must be seconds above 0")

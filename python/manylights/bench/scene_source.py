@@ -102,13 +102,14 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     try:
         with loading.search_beside(path), threads_for_files():
             _, state = loading.parse(path, defines)
+            files = loading.files_of(state)
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
     folder, file_name = Path(path).resolve().parts[-2:]
     text = f"{folder}/{file_name}"
     digest = hashlib.sha256(json.dumps(defines, sort_keys=True).encode())
-    for file in _files_of(path, state):
+    for file in files:
         digest.update(file.read_bytes())
 
     def load() -> LoadedScene:
@@ -120,17 +121,6 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     stem = Path(path).stem
     name = _plain(folder if stem == "scene" else stem)
     return Source(text, name, name, digest.hexdigest(), load)
-
-
-def _files_of(path: str, state) -> list[Path]:
-    """Return the XML files of a parsed scene and the files that it refers to."""
-    folder = Path(path).resolve().parent
-    files = [Path(str(file)) for file in state.files]
-    for node in state.nodes:
-        for _, value in node.props.items():
-            if isinstance(value, str) and value and (folder / value).is_file():
-                files.append(folder / value)
-    return files
 
 
 def _load_file(path: str, defines: dict[str, str]) -> LoadedScene:
