@@ -154,9 +154,7 @@ public:
         for (const LightBounds &bounds : table.bounds)
             m_tree.oriented |=
                 bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0;
-        for (const auto &shape : scene->shapes())
-            m_glossy |= shape->bsdf() &&
-                        has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy);
+        m_glossy           = any_glossy(scene);
         m_media            = Media<Float, Spectrum>::find(scene);
         m_tree.light_count = (uint32_t) rows.size();
         m_tree.nodes =
@@ -192,6 +190,10 @@ public:
                 result.mix(shape->has_flipped_normals());
             }
         }
+        // The same emitters may belong to another scene: a new one that lies in memory
+        // where a deleted one lay
+        MediaKinds media = Media<Float, Spectrum>::find(scene);
+        result.mix(4 * any_glossy(scene) + 2 * media.homogeneous + media.heterogeneous);
         return result;
     }
 
@@ -239,6 +241,14 @@ private:
     using Storage = typename Tree::Storage;
     using IndexStorage =
         std::conditional_t<dr::is_jit_v<Float>, UInt32D, dr::DynamicArray<UInt32D>>;
+
+    static bool any_glossy(const Scene *scene) {
+        for (const auto &shape : scene->shapes())
+            if (shape->bsdf() &&
+                has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy))
+                return true;
+        return false;
+    }
 
     static std::vector<LightRow> ordered_rows(const Table &table, const LightTree &tree) {
         std::vector<LightRow> rows(table.rows.size());
