@@ -101,15 +101,15 @@ def interrupt(variant, name, spp, after):
 def test_ctrl_c_stops_a_scalar_render(scalar, name):
     """It ends soon, with the exception that Python programs expect, as with Mitsuba's own."""
     seconds, said = interrupt(scalar, name, MINUTES, after=0.5)
-    assert said == "interrupted"
+    assert said.endswith("interrupted")
     assert seconds < SOON
 
 
-@with_mitsubas
+@pytest.mark.parametrize("name", ["direct", "manylights_direct"])
 def test_ctrl_c_is_heeded_after_a_kernel(llvm, name):
     """A kernel that runs cannot be stopped, nor can Mitsuba's own: the exception comes after it."""
-    _, said = interrupt(llvm, name, 2**15, after=0.2)
-    assert said == "interrupted"
+    _, said = interrupt(llvm, name, 2**15, after=0.1)
+    assert said.endswith("interrupted")
 
 
 @with_mitsubas
@@ -205,14 +205,20 @@ print(json.dumps({"grown": used[-1] - used[0], "tree": tree}))
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
 @both_variants
 @pytest.mark.parametrize("action", ["render", "rebuild", "load", "load, one integrator"])
-@pytest.mark.parametrize("name", OURS)
-@pytest.mark.parametrize("lights", [20_000, pytest.param(200_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "lights"),
+    [
+        ("manylights_direct", 5_000),
+        pytest.param("manylights_direct", 100_000, marks=pytest.mark.slow),
+        pytest.param("manylights_volpath", 100_000, marks=pytest.mark.slow),
+    ],
+)
 def test_memory_does_not_grow(variant, action, name, lights):
     """Fifty renders, rebuilds or scenes need no more than five.
 
-    A tree, a table or a scene that is not released each time would be kept 45 times. What is
-    allowed is a fifth of the tree each time, some megabytes: more than the noise of allocators,
-    less than the smallest of those. Needs a process of its own, where nothing was released before.
+    A tree that is not released each time would be kept 45 times. A fifth of that is allowed, 6 MB
+    with 5,000 lights: the noise of allocators is below 1 MB. Needs a process of its own, since a
+    leak may fill what others have released before.
     """
     result = run_python(WATCH_MEMORY, variant, action, name, lights, REPEATS, WARM_UP)
     assert result["grown"] < 0.2 * result["tree"] * (REPEATS - WARM_UP)
@@ -246,7 +252,7 @@ def test_two_threads_render_two_scenes(variant, name, scenes, shared):
     found = [[], []]
 
     def work(index):
-        for _ in range(6):
+        for _ in range(3):
             found[index].append(image(scenes[index], integrators[index]))
 
     workers = [threading.Thread(target=work, args=(index,)) for index in range(2)]
@@ -255,7 +261,7 @@ def test_two_threads_render_two_scenes(variant, name, scenes, shared):
     for worker in workers:
         worker.join()
     for images, wanted in zip(found, expected):
-        assert len(images) == 6
+        assert len(images) == 3
         assert all(np.array_equal(image, wanted) for image in images)
 
 
@@ -263,48 +269,46 @@ def test_two_threads_render_two_scenes(variant, name, scenes, shared):
 
 RENDERED = """
 import json, sys
-import mitsuba as mi
 import manylights
 from tests import test_robust
 
-print(json.dumps(test_robust.rendered_in(sys.argv[1], sys.argv[2])))
+print(json.dumps(test_robust.rendered_in(sys.argv[1])))
 """
 
 
-def rendered_in(variant, name):
-    """Set the variant, load a scene and render it; a list of all values."""
+def rendered_in(variant):
+    """Set the variant, load a scene and render it with both plugins; a list of all values."""
     mi.set_variant(variant)
     scene = mi.load_dict({**light_scenes.stage(), **light_scenes.points(), **light_scenes.spots()})
-    return np.ravel(image(scene, mi.load_dict({"type": name}))).tolist()
+    images = [image(scene, mi.load_dict({"type": name})) for name in OURS]
+    return np.ravel(images).tolist()
 
 
-def compiled_variants():
-    """The variants that Mitsuba and the plugin have and this machine can run."""
-    before, found = mi.variant(), []
-    for variant in mi.variants():
-        backend = {"llvm": dr.JitBackend.LLVM, "cuda": dr.JitBackend.CUDA}.get(variant[:4])
-        if backend is not None and not has_backend(backend):
-            continue
-        mi.set_variant(variant)
-        try:
-            mi.load_dict({"type": "manylights_direct"})
-        except RuntimeError as error:
-            assert "was compiled for the variants" in str(error)
-        else:
-            found.append(variant)
-    mi.set_variant(before)
-    return found
+def compiled(variant):
+    """Does the plugin have a variant that this machine can run?"""
+    backend = {"llvm": dr.JitBackend.LLVM, "cuda": dr.JitBackend.CUDA}.get(variant[:4])
+    if variant not in mi.variants() or (backend is not None and not has_backend(backend)):
+        return False
+    mi.set_variant(variant)
+    try:
+        mi.load_dict({"type": "manylights_direct"})
+    except RuntimeError as error:
+        assert "was compiled for the variants" in str(error)
+        return False
+    return True
 
 
-@pytest.mark.parametrize("name", OURS)
-def test_variants_in_turn(scalar, name):
+@pytest.mark.parametrize(
+    "variants", [["scalar_rgb", "llvm_ad_rgb"], pytest.param(mi.variants(), marks=pytest.mark.slow)]
+)
+def test_variants_in_turn(scalar, variants):
     """Each gives what it gives alone in a process, again and again."""
-    variants = compiled_variants()
+    variants = [variant for variant in variants if compiled(variant)]
     if len(variants) < 2:
-        pytest.skip("only one variant can be used here")
-    alone = {variant: run_python(RENDERED, variant, name) for variant in variants}
-    for variant in [*variants, *reversed(variants), *variants]:
-        assert rendered_in(variant, name) == alone[variant]
+        pytest.skip("only one of these variants can be used here")
+    alone = {variant: run_python(RENDERED, variant) for variant in variants}
+    for variant in [*variants, *reversed(variants)]:
+        assert rendered_in(variant) == alone[variant]
 
 
 # ----------------------------------------------------------------------------------- large images
@@ -317,7 +321,9 @@ def block_means(picture, size=64):
     return blocks.mean(axis=(1, 3), dtype=np.float64)
 
 
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize(
+    "name", ["manylights_direct", pytest.param("manylights_volpath", marks=pytest.mark.slow)]
+)
 def test_more_than_16_million_samples_at_once(llvm, name):
     """Indices beyond 2^24, which floats do not have, give the means of smaller renders."""
     description = light_scenes.SCENES["points-2"]()
