@@ -126,7 +126,7 @@ def test_image_does_not_depend_on_other_scenes(variant):
     In JIT variants they share the numbers by which kernels know emitters and shapes.
     """
     alone = rendered_fog()
-    scenes = [path_scenes.load(name) for name in ("lamps-inside", "smoke", "points-inside")]
+    scenes = [path_scenes.load(name) for name in ("lamps-inside", "points-inside")]
     images = [paths(scene) for scene in scenes]
     assert np.array_equal(images[-1], alone)
     assert np.array_equal(paths(scenes[-1]), alone)

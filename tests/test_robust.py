@@ -339,3 +339,25 @@ def test_more_than_16_million_samples_at_once(llvm, name):
     limit = stats.t.isf(SIGNIFICANCE / 2 / large.size, count - 1)
     assert (np.abs(large - small.mean(axis=0)) <= limit * error + 1e-6).all()
     assert error.mean() < 0.01 * large.mean()
+
+
+# -------------------------------------------------------------------------------------- all scenes
+
+METHODS = ["resampled_tree", "talk", "adaptive_splitting", "tree", "exhaustive"]
+SCENES = {
+    "manylights_direct": light_scenes.SCENES,
+    "manylights_volpath": {**light_scenes.SCENES, **path_scenes.SCENES},
+}
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "scalar_spectral"], indirect=True)
+@pytest.mark.parametrize("name", OURS)
+def test_all_scenes_with_all_methods_are_finite(variant, name):
+    """One sample of each pixel: for `make test-sanitized`, where means would take too long."""
+    if not compiled(variant):
+        pytest.skip(f"the plugin was compiled without {variant}")
+    integrators = [mi.load_dict({"type": name, "method": method}) for method in METHODS]
+    for key, make in SCENES[name].items():
+        scene = mi.load_dict(make())
+        for method, integrator in zip(METHODS, integrators):
+            assert np.isfinite(image(scene, integrator, spp=1)).all(), (key, method)
