@@ -108,7 +108,7 @@ def test_ctrl_c_stops_a_scalar_render(scalar, name):
 @pytest.mark.parametrize("name", ["direct", "manylights_direct"])
 def test_ctrl_c_is_heeded_after_a_kernel(llvm, name):
     """A kernel that runs cannot be stopped, nor can Mitsuba's own: the exception comes after it."""
-    _, said = interrupt(llvm, name, 2**15, after=0.1)
+    _, said = interrupt(llvm, name, 2**14, after=0.1)
     assert said.endswith("interrupted")
 
 
