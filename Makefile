@@ -24,7 +24,7 @@ INSTALLED   := $(VENV)/.installed-$(VARIANTS_ID)
 
 .PHONY: help
 help:  ## Show this list
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 23
 
 .PHONY: demo
 demo: $(INSTALLED)  ## Render a city with more than 10,000 lights to demo.exr and demo.png
@@ -40,6 +40,24 @@ test: $(INSTALLED)  ## Run the quick tests
 .PHONY: test-slow
 test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+# Another build, beside the usual one. What it finds ends the process, so that its report must
+# not be kept by pytest; memory is not given back at once and cannot be watched. Tests of means
+# are left out: they render the scenes that test_robust.py renders, hundreds of times.
+SANITIZED       := build/sanitized
+SANITIZED_TESTS := $(addprefix tests/test_,tree.py resampling.py counts.py determinism.py \
+                   scene_updates.py robust.py) -k "not memory and not mean"
+
+.PHONY: test-sanitized
+test-sanitized: $(INSTALLED)  ## Run tests with checks of memory access and undefined behaviour (GCC)
+	MANYLIGHTS_VARIANTS=scalar_rgb,scalar_spectral $(PIP) install --quiet --upgrade --no-deps \
+	  --no-build-isolation --target $(SANITIZED)/site -C build-dir=$(SANITIZED)/objects \
+	  -C cmake.build-type=RelWithDebInfo -C cmake.define.MANYLIGHTS_SANITIZE=ON .
+	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) \
+	  $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	  DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath $(SANITIZED)/site) \
+	  $(BIN)/python -m pytest --capture=sys $(SANITIZED_TESTS) $(ARGS)
 
 # Without HOME nothing is taken from Dr.Jit's cache on disk: first renders compile.
 .PHONY: bench

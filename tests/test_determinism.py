@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests import light_scenes
+from tests import light_scenes, path_scenes
 
 pytestmark = pytest.mark.usefixtures("plugin")
 
@@ -34,6 +34,17 @@ def rendered(method, seed=7):
     return np.array(mi.render(larger_scene(), integrator=integrator, spp=SAMPLES, seed=seed))
 
 
+def rendered_fog():
+    """A path-traced image from a freshly loaded scene with lights in fog."""
+    return paths(path_scenes.load("points-inside"))
+
+
+def paths(scene, integrator=None):
+    """An image with two bounces."""
+    integrator = integrator or mi.load_dict({"type": "manylights_volpath", "max_depth": 3})
+    return np.array(mi.render(scene, integrator=integrator, spp=SAMPLES, seed=7))
+
+
 def digest(image):
     """Checksum of the bytes of an image."""
     return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
@@ -42,9 +53,11 @@ def digest(image):
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 @pytest.mark.parametrize("method", METHODS)
 def test_image_does_not_depend_on_threads(variant, method, thread_count):
-    """One thread, two threads, and two again give the same bits; another seed does not."""
+    """One, three and two threads, and two again give the same bits; another seed does not."""
     thread_count(1)
     one = rendered(method)
+    thread_count(3)
+    assert np.array_equal(one, rendered(method))
     thread_count(2)
     two = rendered(method)
     assert np.array_equal(one, two)
@@ -67,16 +80,56 @@ def test_repeated_rendering_of_one_scene_is_equal(variant):
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 def test_image_does_not_depend_on_the_process(variant):
-    """A new process renders the same bits."""
+    """A new process renders the same bits, of surfaces and of fog."""
     script = (
         "import mitsuba, manylights\n"
         f"mitsuba.set_variant({variant!r})\n"
-        "from tests.test_determinism import digest, rendered\n"
-        "print(digest(rendered('resampled_tree')))\n"
+        "from tests.test_determinism import digest, rendered, rendered_fog\n"
+        "print(digest(rendered('resampled_tree')), digest(rendered_fog()))\n"
     )
     folder = Path(__file__).parents[1]
     process = subprocess.run(
         [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, check=False
     )
     assert process.returncode == 0, process.stderr
-    assert process.stdout.split()[-1] == digest(rendered("resampled_tree"))
+    expected = [digest(rendered("resampled_tree")), digest(rendered_fog())]
+    assert process.stdout.split()[-2:] == expected
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize(
+    ("name", "load", "scene_name"),
+    [
+        ("manylights_direct", light_scenes.load, "points"),
+        ("manylights_volpath", path_scenes.load, "points-inside"),
+    ],
+)
+def test_moving_a_light_and_back_gives_the_same_bits(variant, name, load, scene_name):
+    """The tree is built three times, and each time in the same way from the same lights."""
+    scene, integrator = load(scene_name), mi.load_dict({"type": name})
+    parameters, key = mi.traverse(scene), "point_7.position"
+    here = [float(x) for x in np.ravel(parameters[key])]
+    there = [here[0] + 0.5, here[1], here[2] - 0.3]
+    images = []
+    for position in (here, there, here):
+        parameters[key] = position
+        parameters.update()
+        images.append(paths(scene, integrator))
+    assert np.array_equal(images[0], images[2])
+    assert not np.array_equal(images[0], images[1])
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_image_does_not_depend_on_other_scenes(variant):
+    """Scenes that are alive, and were rendered in between, do not change it.
+
+    In JIT variants they share the numbers by which kernels know emitters and shapes.
+    """
+    alone = rendered_fog()
+    scenes = [path_scenes.load(name) for name in ("lamps-inside", "points-inside")]
+    images = [paths(scene) for scene in scenes]
+    assert np.array_equal(images[-1], alone)
+    assert np.array_equal(paths(scenes[-1]), alone)
+    for scene, image in zip(scenes, images):
+        assert np.array_equal(paths(scene), image)
+    assert np.array_equal(rendered_fog(), alone)

@@ -345,7 +345,7 @@ SAMPLES = 16
 @both_variants
 @pytest.mark.parametrize("name", ["gallery", "fog-chromatic", "smoke"])
 def test_image_does_not_depend_on_threads(variant, name, thread_count):
-    """One thread, two threads, and two again give the same bits; another seed does not.
+    """One, three and two threads, and two again give the same bits; another seed does not.
 
     All of one loaded scene: Mitsuba's order of several rectangles differs when it is loaded again.
     """
@@ -357,6 +357,8 @@ def test_image_does_not_depend_on_threads(variant, name, thread_count):
 
     thread_count(1)
     one = rendered()
+    thread_count(3)
+    assert rendered() == one
     thread_count(2)
     assert rendered() == one
     assert rendered() == one

@@ -7,6 +7,8 @@ give the image from before the change; each test shows that this one is signific
 
 import gc
 import re
+import threading
+import time
 
 import drjit as dr
 import mitsuba as mi
@@ -269,6 +271,54 @@ def test_new_scene_after_the_old_one_is_deleted(variant, nesting):
         assert_current(scene, integrator, lambda: nested(nesting, light_tree()))
         del scene, description
         gc.collect()
+
+
+@both_variants
+def test_new_scene_with_other_media(variant):
+    """The new scene may lie where the old one lay and have the same lights, and fog besides."""
+    lights = {key: mi.load_dict(light) for key, light in light_scenes.points(2).items()}
+
+    def path_tracer():
+        return mi.load_dict({"type": "manylights_volpath", "max_depth": 3})
+
+    def foggy_or_clear(medium):
+        ball = {"type": "sphere", "radius": 0.5, "material": {"type": "null"}, **medium}
+        return mi.load_dict({**light_scenes.stage(), **lights, "ball": ball})
+
+    media = [{}, {"interior": {"type": "homogeneous", "sigma_t": 4.0}}]
+    clear, foggy = (image(foggy_or_clear(medium), path_tracer()) for medium in media)
+    assert not np.array_equal(clear, foggy)
+    integrator = path_tracer()
+    for _ in range(4):
+        for medium, expected in zip(media, (clear, foggy)):
+            gc.collect()
+            assert np.array_equal(image(foggy_or_clear(medium), integrator), expected)
+
+
+def test_renderings_of_two_threads_that_overlap(scalar):
+    """What is vouched for during a rendering no longer is when the last one has ended.
+
+    The first thread ends before the second one, which begins while the first is at work.
+    """
+    descriptions = [SCENES["points"]() for _ in range(2)]
+    for description in descriptions:
+        description["sensor"]["film"] |= {"width": 96, "height": 64}
+    scenes, integrator = [mi.load_dict(description) for description in descriptions], light_tree()
+    image(scenes[0], integrator)
+    first, second = (
+        threading.Thread(target=image, args=(scene, integrator), kwargs={"spp": spp})
+        for scene, spp in zip(scenes, (32, 128))
+    )
+    first.start()
+    time.sleep(0.1)
+    second.start()
+    first.join()
+    assert second.is_alive()
+    second.join()
+    image(scenes[0], nested("moment", integrator))
+    brighter_point(scenes[0])
+    fresh = nested("moment", light_tree())
+    assert_current(scenes[0], nested("moment", integrator), lambda: fresh)
 
 
 @both_variants

@@ -343,8 +343,7 @@ private:
                 clusters.mean[i].entry(slot) = view.data.entry(6 + i);
             clusters.variance.entry(slot) = view.data.entry(9);
             clusters.flux.entry(slot)     = view.data.entry(10);
-            auto axis =
-                dr::reinterpret_array<dr::int32_array_t<Float>>(view.data.entry(11));
+            auto axis = dr::reinterpret_array<UInt32>(view.data.entry(11));
             for (int i = 0; i < 3; ++i)
                 clusters.axis[i].entry(slot) = unpack_axis<Float>(axis, i);
         }

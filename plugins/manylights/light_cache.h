@@ -29,33 +29,53 @@ public:
 
     explicit LightCache(bool keep_binary) : m_keep_binary(keep_binary) {}
 
-    /// Brings the lights of a scene up to date and vouches for them while it lives
+private:
+    struct Entry {
+        const Scene *scene;
+        Fingerprint<Float> fingerprint;
+        mitsuba::ref<Lights> lights;
+        /// How many calls of `render()` have checked these lights and go on
+        std::atomic<uint32_t> renderings{ 0 };
+    };
+
+public:
+    /// Brings the lights of a scene up to date and vouches for them while it lives. There
+    /// may be several at once: nested ones, or those of threads that render other scenes.
     class Rendering {
     public:
         Rendering(const LightCache &cache, const Scene *scene) : m_cache(cache) {
-            cache.update(scene);
-            m_outer = cache.m_rendering.exchange(scene);
+            std::lock_guard<std::mutex> guard(cache.m_mutex);
+            m_entry = &cache.update(scene);
+            ++m_entry->renderings;
+            ++cache.m_renderings;
         }
-        ~Rendering() { m_cache.m_rendering = m_outer; }
+        ~Rendering() {
+            std::lock_guard<std::mutex> guard(m_cache.m_mutex);
+            --m_entry->renderings;
+            --m_cache.m_renderings;
+        }
         Rendering(const Rendering &) = delete;
 
     private:
         const LightCache &m_cache;
-        const Scene *m_outer;
+        Entry *m_entry;
     };
 
     /// The lights of a scene, for `sample()`; cheap enough for every ray
     const Lights &get(const Scene *scene, const Sampler *sampler) const {
         const Entry *current = m_current.load(std::memory_order_acquire);
-        if (current && current->scene == scene && m_rendering == scene)
+        if (current && current->scene == scene && current->renderings > 0)
             return *current->lights;
         if constexpr (dr::is_jit_v<Float>) {
             (void) sampler;
-            return update(scene);
+            std::lock_guard<std::mutex> guard(m_mutex);
+            return *update(scene).lights;
         } else {
             thread_local Visit last;
-            if (!last.is(this, scene, sampler))
-                last.set(this, scene, sampler, update(scene));
+            if (!last.is(this, scene, sampler)) {
+                std::lock_guard<std::mutex> guard(m_mutex);
+                last.set(this, scene, sampler, *update(scene).lights);
+            }
             return *last.lights;
         }
     }
@@ -106,16 +126,9 @@ private:
         }
     };
 
-    struct Entry {
-        const Scene *scene;
-        Fingerprint<Float> fingerprint;
-        mitsuba::ref<Lights> lights;
-    };
-
     /// Make the lights of a scene current, and build them if they are new or changed
-    const Lights &update(const Scene *scene) const {
+    Entry &update(const Scene *scene) const {
         refuse_freezing();
-        std::lock_guard<std::mutex> guard(m_mutex);
         Fingerprint<Float> fingerprint = Lights::fingerprint(scene);
         for (const auto &entry : m_entries)
             if (entry && entry->scene == scene && entry->fingerprint == fingerprint)
@@ -133,7 +146,7 @@ private:
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
         m_current = nullptr;
         // Another thread may still be rendering with what is replaced
-        if (!m_rendering)
+        if (m_renderings == 0)
             m_retired.clear();
         if (m_entries[slot])
             m_retired.push_back(std::move(m_entries[slot]));
@@ -141,9 +154,9 @@ private:
         return m_entries[slot].get();
     }
 
-    const Lights &select(Entry *entry) const {
+    Entry &select(Entry *entry) const {
         m_current.store(entry, std::memory_order_release);
-        return *entry->lights;
+        return *entry;
     }
 
     static void refuse_freezing() {
@@ -170,8 +183,8 @@ private:
     mutable std::unique_ptr<Entry> m_entries[2];
     mutable std::vector<std::unique_ptr<Entry>> m_retired;
     mutable std::atomic<Entry *> m_current{ nullptr };
-    /// The scene whose lights `render()` has just checked
-    mutable std::atomic<const Scene *> m_rendering{ nullptr };
+    /// Of all scenes
+    mutable uint32_t m_renderings = 0;
     Statistics m_statistics;
 
     static constexpr const char *ClassName = "LightCache"; // for log messages

@@ -50,8 +50,11 @@ template <typename Float> struct TreeView {
 
 /// One coordinate of an axis that \ref pack_axis packed into signed fields of 10 bits
 template <typename Value>
-Value unpack_axis(const dr::int32_array_t<Value> &packed, int coordinate) {
-    return Value((packed << (22 - 10 * coordinate)) >> 22) * (1.f / 511.f);
+Value unpack_axis(const dr::uint32_array_t<Value> &packed, int coordinate) {
+    // Shifted up without a sign, where no bit is one too many, and down with it
+    auto upper =
+        dr::reinterpret_array<dr::int32_array_t<Value>>(packed << (22 - 10 * coordinate));
+    return Value(upper >> 22) * (1.f / 511.f);
 }
 
 /// A wide node, gathered
@@ -81,16 +84,15 @@ private:
         auto four = [&](size_t i) {
             return Four<Float>(read(i), read(i + 1), read(i + 2), read(i + 3));
         };
-        using I4 = dr::int32_array_t<Four<Float>>;
+        using U4 = dr::uint32_array_t<Four<Float>>;
         for (int i = 0; i < 3; ++i)
             clusters.mean[i] = four(4 * i);
         clusters.variance = four(12);
         clusters.flux     = four(16);
         if (tree.directions != Directions::All) {
-            I4 axis = dr::reinterpret_array<I4>(four(20));
-            for (int i = 0; i < 3; ++i) // signed 10-bit fields
-                clusters.axis[i] =
-                    Four<Float>((axis << (22 - 10 * i)) >> 22) * (1.f / 511.f);
+            U4 axis = dr::reinterpret_array<U4>(four(20));
+            for (int i = 0; i < 3; ++i)
+                clusters.axis[i] = unpack_axis<Four<Float>>(axis, i);
         }
         for (size_t i = 0; i < 4; ++i)
             child.entry(i) = dr::reinterpret_array<UInt32>(read(24 + i));

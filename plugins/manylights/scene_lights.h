@@ -151,10 +151,8 @@ public:
         m_can_be_hit         = table.can_be_hit;
         for (const LightRow &row : rows)
             m_tree.kinds.insert((LightKind) (row.tag & kTagKindMask));
-        m_tree.directions = directions(table);
-        for (const auto &shape : scene->shapes())
-            m_glossy |= shape->bsdf() &&
-                        has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy);
+        m_tree.directions  = directions(table);
+        m_glossy           = any_glossy(scene);
         m_media            = Media<Float, Spectrum>::find(scene);
         m_tree.light_count = (uint32_t) rows.size();
         m_tree.nodes =
@@ -190,6 +188,10 @@ public:
                 result.mix(shape->has_flipped_normals());
             }
         }
+        // The same emitters may belong to another scene: a new one that lies in memory
+        // where a deleted one lay
+        MediaKinds media = Media<Float, Spectrum>::find(scene);
+        result.mix(4 * any_glossy(scene) + 2 * media.homogeneous + media.heterogeneous);
         return result;
     }
 
@@ -245,6 +247,14 @@ private:
             if (bounds.axis[0] != 0 || bounds.axis[1] != 0 || bounds.axis[2] != 0)
                 return Directions::Broad;
         return Directions::All;
+    }
+
+    static bool any_glossy(const Scene *scene) {
+        for (const auto &shape : scene->shapes())
+            if (shape->bsdf() &&
+                has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy))
+                return true;
+        return false;
     }
 
     static std::vector<LightRow> ordered_rows(const Table &table, const LightTree &tree) {
