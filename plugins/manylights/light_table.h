@@ -16,6 +16,7 @@
 
 #include "mesh_emission.h"
 #include <cstring>
+#include <mitsuba/core/logger.h>
 #include <mitsuba/core/qmc.h>
 #include <mitsuba/render/scene.h>
 
@@ -61,6 +62,7 @@ public:
         const auto &emitters = scene->emitters();
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
+        reader.warn_of_invalid_lights();
         return std::move(reader.m_table);
     }
 
@@ -85,8 +87,31 @@ private:
                  has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
+            ParameterReader params(emitter);
+            for (const char *name : { "irradiance", "radiance" })
+                check(EmissionReader<Float, Spectrum>::read(params, name).luminance);
         } else
             add_other(emitter);
+    }
+
+    /// Note a light whose power is not a finite number >= 0
+    void check(float power) {
+        if (std::isfinite(power) && power >= 0)
+            return;
+        if (m_invalid++ == 0)
+            m_first_invalid = m_emitter;
+    }
+
+    /// Without a word they would just be missing from the image
+    void warn_of_invalid_lights() const {
+        if (m_invalid == 0)
+            return;
+        const Emitter *first = m_scene->emitters()[m_first_invalid].get();
+        std::string_view id  = first->shape() ? first->shape()->id() : first->id();
+        Log(mitsuba::Warn,
+            "Lights that are never chosen: %u of %u. Their power must not be negative, "
+            "and power and position must be finite. The first one belongs to \"%s\".",
+            m_invalid, m_table.light_count, id);
     }
 
     // ------------------------------------------------------------- Points and spots
@@ -524,7 +549,10 @@ private:
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
         m_table.can_be_hit |= hit_able;
-        if (!finite || !(bounds.flux > 0)) {
+        // The flux of a spot does not show the sign
+        float power = finite ? std::min(bounds.flux, row.luminance) : dr::Infinity<float>;
+        check(power);
+        if (!finite || !(power > 0)) {
             m_only_hit = by_plugin; // black as far as the quadrature saw
             return;
         }
@@ -537,6 +565,10 @@ private:
     /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
     bool m_only_hit    = false;
+    /// Lights that \ref check noted, and the index of the first one's emitter
+    uint32_t m_invalid = 0, m_first_invalid = 0;
+
+    static constexpr const char *ClassName = "LightTable"; // for log messages
 };
 
 } // namespace manylights
