@@ -62,6 +62,7 @@ public:
         const auto &emitters = scene->emitters();
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
+        reader.estimate_unknown_powers();
         reader.warn_of_invalid_lights();
         return std::move(reader.m_table);
     }
@@ -398,8 +399,10 @@ private:
             m_table.infinite.push_back(emitter);
             return;
         }
+        float power = emitted_power(emitter);
+        bool known  = power > 0;
         Emission e;
-        e.luminance        = emitted_power(emitter) / (4 * dr::Pi<float>);
+        e.luminance        = known ? power / (4 * dr::Pi<float>) : kUnknownPower;
         LightRow row       = make_row(LightKind::Other, e);
         LightBounds bounds = {};
         double square      = 0;
@@ -413,8 +416,24 @@ private:
         bounds.variance = (float) (square / 3);
         std::copy_n(bounds.mean, 3, row.geometry);
         row.geometry[3] = bounds.variance;
-        bounds.flux     = 4 * dr::Pi<float> * e.luminance;
+        bounds.flux     = known ? power : kUnknownPower;
         add_light(row, bounds);
+    }
+
+    /// Give lights of unknown power the mean of the others, which is right in any unit
+    void estimate_unknown_powers() {
+        double sum   = 0;
+        size_t known = 0;
+        for (const LightBounds &bounds : m_table.bounds) {
+            sum += bounds.flux;
+            known += bounds.flux != kUnknownPower;
+        }
+        float mean = known ? (float) (sum / (double) known) : 1.f;
+        for (size_t i = 0; i < m_table.bounds.size(); ++i)
+            if (m_table.bounds[i].flux == kUnknownPower) {
+                m_table.bounds[i].flux    = mean;
+                m_table.rows[i].luminance = mean / (4 * dr::Pi<float>);
+            }
     }
 
     /// Some shapes (ellipsoidsmesh) do not tell their emitter about themselves
@@ -461,7 +480,8 @@ private:
         return dr::all(dr::isfinite(low) && dr::isfinite(high) && low <= high);
     }
 
-    /// Mean weight of rays that the emitter sends out; 1 if it cannot send any
+    /// Mean weight of rays that the emitter sends out; 0 if that is not known: it may not be
+    /// able to send any, or a narrow beam was missed
     static float emitted_power(const Emitter *emitter) {
         MI_IMPORT_CORE_TYPES()
         constexpr uint32_t count = 1024;
@@ -488,9 +508,7 @@ private:
                 power /= MI_CIE_MAX - MI_CIE_MIN;
         } catch (const std::exception &) {
         }
-        /* A beam may have been missed, and a light that is left out is dark: the weight only
-           has to be positive. */
-        return power > 0 && std::isfinite(power) ? power : 1.f;
+        return std::isfinite(power) ? power : 0.f;
     }
 
     // ----------------------------------------------------------------- Common parts
@@ -559,6 +577,9 @@ private:
         m_table.rows.push_back(row);
         m_table.bounds.push_back(bounds);
     }
+
+    /// Stands for a power that could not be found, and is too small to count
+    static constexpr float kUnknownPower = std::numeric_limits<float>::min();
 
     const Scene *m_scene = nullptr;
     Table m_table;
