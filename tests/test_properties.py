@@ -608,7 +608,7 @@ def check_rendering(scene):
         assert np.isfinite(image).all() and (image >= 0).all()
 
 
-@quick_and_slow(60, 2000)
+@quick_and_slow(60, 500)
 def test_any_scene_renders(scalar, examples):
     """Also without an emitter, with black ones only, and with all sizes at once."""
     for_examples(check_rendering, any_scene, examples)
@@ -717,14 +717,14 @@ def ours_in_two_orders(scene):
 FOG = {"fog": st.just(True), "environment": st.none(), "count": st.integers(1, 60)}
 
 
-@quick_and_slow(8, 200)
+@quick_and_slow(8, 100)
 @pytest.mark.parametrize("strategy", [scenes(), scenes(**FOG)], ids=["surfaces", "fog"])
 def test_mean_in_any_scene(scalar, strategy, examples):
     """It is the mean of Mitsuba's `direct`, or of `volpath` in fog; 2 % more are found."""
     compare_in_scenes(strategy, examples, ours_and_reference)
 
 
-@quick_and_slow(8, 200)
+@quick_and_slow(6, 100)
 def test_order_of_emitters_in_any_scene(scalar, examples):
     """It does not change the mean; 2 % more are found."""
     compare_in_scenes(scenes(), examples, ours_in_two_orders)
