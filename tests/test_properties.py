@@ -499,11 +499,13 @@ class Scene:
         return power * generator.uniform(0.3, 1, 3)
 
     def emitter(self, generator):
-        """One light, more than 0.9 m from the receiver and on any side of it."""
+        """One light on any side of the receiver, 0.9 m away or more; extreme ones also on it."""
         kind = sorted(self.kinds)[generator.integers(len(self.kinds))]
         direction = generator.normal(size=3) * (1, 1, 0.7) + (0, 0, 0.4)
         direction /= np.linalg.norm(direction)
         position = direction * generator.uniform(0.9, 3) * self.scale
+        if self.extreme:
+            position *= generator.choice([0, 1e-3, 1])
         target = self.scale * generator.uniform(-0.1, 0.1, 3)
         frame = transform().look_at(position.tolist(), target.tolist(), [0.3, 0.5, 0.9])
         power = self.scale**2
