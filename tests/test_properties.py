@@ -340,6 +340,17 @@ def test_choice_from_any_tree(check, examples):
     for_examples(check, looks, examples)
 
 
+@pytest.mark.parametrize("flux", [[], [1, 0], [1, -1], [1, math.nan], [1, math.inf]])
+def test_lights_without_a_positive_finite_flux_are_refused(flux):
+    """The smallest tree has one light, and each light has a flux that it can be chosen by."""
+    flux = np.array(flux, np.float32)
+    mean = np.zeros((len(flux), 3), np.float32)
+    with pytest.raises(
+        ValueError, match="^(flux must be positive and finite|a tree needs at least one light)$"
+    ):
+        core.Tree(mean, flux, mean, flux)
+
+
 # -------------------------------------------------------------------------- order of the lights
 
 
