@@ -345,9 +345,8 @@ def test_lights_without_a_positive_finite_flux_are_refused(flux):
     """The smallest tree has one light, and each light has a flux that it can be chosen by."""
     flux = np.array(flux, np.float32)
     mean = np.zeros((len(flux), 3), np.float32)
-    with pytest.raises(
-        ValueError, match="^(flux must be positive and finite|a tree needs at least one light)$"
-    ):
+    words = "positive and finite" if len(flux) else "at least one light"
+    with pytest.raises(ValueError, match=words):
         core.Tree(mean, flux, mean, flux)
 
 
