@@ -58,7 +58,7 @@ def quick_and_slow(quick, slow):
     )
 
 
-seeds = st.integers(0, 2**31 - 1)
+seeds = st.integers(0, 2**31 - 1000)
 
 
 # ------------------------------------------------------------------------------------------ trees
@@ -651,7 +651,11 @@ ERROR = 5e-3
 
 
 def images(loaded, integrator, first_seed):
-    """Renderings (seeds, height, width, channels), with as many samples as their error needs."""
+    """Renderings (seeds, height, width, channels), with as many samples as their error needs.
+
+    Each scene has seeds of its own: with equal ones, free flights through fog are the same in all
+    scenes, and so are the errors of their means.
+    """
     pilot = tools.render_seeds(loaded, integrator, 64, range(first_seed, first_seed + 8))
     spp = tools.samples_for_precision(pilot, 64, SEEDS, ERROR, largest=1 << 13)
     seeds = range(first_seed + 100, first_seed + 100 + SEEDS)
@@ -664,7 +668,7 @@ def reference_images(scene):
     if scene.count:
         set_power_weights(loaded, samples=16)
     kind = {"type": "volpath", "max_depth": 2} if scene.fog else {"type": "direct"}
-    return images(loaded, mi.load_dict(kind), 10_000)
+    return images(loaded, mi.load_dict(kind), 2**31 + scene.seed)
 
 
 def assert_equal_in_scenes(estimates):
@@ -716,13 +720,15 @@ def compare_in_scenes(strategy, count, estimate):
 
 def ours_and_reference(scene):
     """The estimate under test, and Mitsuba's."""
-    return images(scene.load(), ours(scene), 0), reference_images(scene)
+    return images(scene.load(), ours(scene), scene.seed), reference_images(scene)
 
 
 def ours_in_two_orders(scene):
     """The estimate under test, for the emitters in two orders."""
     order = np.random.default_rng(scene.seed).permutation(scene.count)
-    return images(scene.load(), ours(scene), 0), images(scene.load(order), ours(scene), 10_000)
+    return images(scene.load(), ours(scene), scene.seed), images(
+        scene.load(order), ours(scene), 2**31 + scene.seed
+    )
 
 
 FOG = {"fog": st.just(True), "environment": st.none(), "count": st.integers(1, 60)}
@@ -745,7 +751,7 @@ def test_planted_bias_of_one_emitter_is_found(scalar):
     """One of two to eight points is brighter by a tenth."""
 
     def ours_and_brighter(scene):
-        return images(scene.load(factors=[1.1]), ours(scene), 0), reference_images(scene)
+        return images(scene.load(factors=[1.1]), ours(scene), scene.seed), reference_images(scene)
 
     points = {"kinds": st.just(frozenset(["point"])), "count": st.integers(2, 8)}
     few = scenes(**points, environment=st.none(), black=st.just(0.0), decades=st.just(0.0))
