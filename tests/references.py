@@ -65,7 +65,7 @@ def set_power_weights(scene, samples=64):
     A tenth of the average is added, so that no emitter is starved.
     """
     powers = emitter_powers(scene, samples)
-    weights = powers / powers.mean() + 0.1
+    weights = powers / (powers.mean() or 1) + 0.1  # black scenes have no power
     for emitter, weight in zip(scene.emitters(), weights):
         parameters = mi.traverse(emitter)
         parameters["sampling_weight"] = float(weight)

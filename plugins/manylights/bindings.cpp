@@ -60,6 +60,11 @@ public:
             variance.shape(0) != count)
             throw nb::value_error(
                 "mean, flux, axis and variance must have the same length");
+        if (count == 0)
+            throw nb::value_error("a tree needs at least one light");
+        for (size_t i = 0; i < count; ++i)
+            if (!(flux(i) > 0) || !std::isfinite(flux(i)))
+                throw nb::value_error("flux must be positive and finite");
         std::vector<LightBounds> bounds(count);
         for (size_t i = 0; i < count; ++i)
             bounds[i] = make_bounds(mean, flux(i), axis, variance(i), i);
@@ -120,6 +125,9 @@ public:
     const std::vector<uint32_t> &order() const { return m_tree.order; }
     nb::bytes nodes() const {
         return nb::bytes(m_tree.wide.data(), m_tree.wide.size() * sizeof(WideNode));
+    }
+    nb::bytes binary_nodes() const {
+        return nb::bytes(m_tree.binary.data(), m_tree.binary.size() * sizeof(BinaryNode));
     }
 
 private:
@@ -238,7 +246,8 @@ NB_MODULE(_core, m) {
         .def_prop_ro("depth", &Tree::depth, "Levels of the 4-wide tree.")
         .def_prop_ro("node_count", &Tree::node_count, "Nodes of the 4-wide tree.")
         .def_prop_ro("order", &Tree::order, "Input index of each leaf, in tree order.")
-        .def_prop_ro("nodes", &Tree::nodes, "The 4-wide nodes as bytes.");
+        .def_prop_ro("nodes", &Tree::nodes, "The 4-wide nodes as bytes.")
+        .def_prop_ro("binary_nodes", &Tree::binary_nodes, "The binary nodes as bytes.");
     m.def("select", &select_items, "targets"_a, "picks"_a, "offset"_a,
           "Threshold-systematic selection: chosen items, and weights max(1, tau / "
           "target).");

@@ -16,6 +16,7 @@
 
 #include "mesh_emission.h"
 #include <cstring>
+#include <mitsuba/core/logger.h>
 #include <mitsuba/core/qmc.h>
 #include <mitsuba/render/scene.h>
 
@@ -68,6 +69,8 @@ public:
             reader.m_table.beams |= is_beam(emitter.get());
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
+        reader.estimate_unknown_powers();
+        reader.warn_of_invalid_lights();
         return std::move(reader.m_table);
     }
 
@@ -99,8 +102,31 @@ private:
                  has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
+            ParameterReader params(emitter);
+            for (const char *name : { "irradiance", "radiance" })
+                check(EmissionReader<Float, Spectrum>::read(params, name).luminance);
         } else
             add_other(emitter);
+    }
+
+    /// Note a light whose power is not a finite number >= 0
+    void check(float power) {
+        if (std::isfinite(power) && power >= 0)
+            return;
+        if (m_invalid++ == 0)
+            m_first_invalid = m_emitter;
+    }
+
+    /// Without a word they would just be missing from the image
+    void warn_of_invalid_lights() const {
+        if (m_invalid == 0)
+            return;
+        const Emitter *first = m_scene->emitters()[m_first_invalid].get();
+        std::string_view id  = first->shape() ? first->shape()->id() : first->id();
+        Log(mitsuba::Warn,
+            "Lights that are never chosen: %u of %u. Their power must not be negative, "
+            "and power and position must be finite. The first one belongs to \"%s\".",
+            m_invalid, m_table.light_count, id);
     }
 
     // ------------------------------------------------------------- Points and spots
@@ -393,8 +419,10 @@ private:
             m_table.infinite.push_back(emitter);
             return;
         }
+        float power = emitted_power(emitter);
+        bool known  = power > 0;
         Emission e;
-        e.luminance        = emitted_power(emitter) / (4 * dr::Pi<float>);
+        e.luminance        = known ? power / (4 * dr::Pi<float>) : kUnknownPower;
         LightRow row       = make_row(LightKind::Other, e);
         LightBounds bounds = {};
         double square      = 0;
@@ -408,8 +436,24 @@ private:
         bounds.variance = (float) (square / 3);
         std::copy_n(bounds.mean, 3, row.geometry);
         row.geometry[3] = bounds.variance;
-        bounds.flux     = 4 * dr::Pi<float> * e.luminance;
+        bounds.flux     = known ? power : kUnknownPower;
         add_light(row, bounds);
+    }
+
+    /// Give lights of unknown power the mean of the others, which is right in any unit
+    void estimate_unknown_powers() {
+        double sum   = 0;
+        size_t known = 0;
+        for (const LightBounds &bounds : m_table.bounds) {
+            sum += bounds.flux;
+            known += bounds.flux != kUnknownPower;
+        }
+        float mean = known ? (float) (sum / (double) known) : 1.f;
+        for (size_t i = 0; i < m_table.bounds.size(); ++i)
+            if (m_table.bounds[i].flux == kUnknownPower) {
+                m_table.bounds[i].flux    = mean;
+                m_table.rows[i].luminance = mean / (4 * dr::Pi<float>);
+            }
     }
 
     /// Some shapes (ellipsoidsmesh) do not tell their emitter about themselves
@@ -456,7 +500,8 @@ private:
         return dr::all(dr::isfinite(low) && dr::isfinite(high) && low <= high);
     }
 
-    /// Mean weight of rays that the emitter sends out; 1 if it cannot send any
+    /// Mean weight of rays that the emitter sends out; 0 if that is not known: it may not be
+    /// able to send any, or a narrow beam was missed
     static float emitted_power(const Emitter *emitter) {
         MI_IMPORT_CORE_TYPES()
         constexpr uint32_t count = 1024;
@@ -483,9 +528,7 @@ private:
                 power /= MI_CIE_MAX - MI_CIE_MIN;
         } catch (const std::exception &) {
         }
-        /* A beam may have been missed, and a light that is left out is dark: the weight only
-           has to be positive. */
-        return power > 0 && std::isfinite(power) ? power : 1.f;
+        return std::isfinite(power) ? power : 0.f;
     }
 
     // ----------------------------------------------------------------- Common parts
@@ -545,7 +588,10 @@ private:
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
         m_table.can_be_hit |= hit_able;
-        if (!finite || !(bounds.flux > 0)) {
+        // The flux of a spot does not show the sign
+        float power = finite ? std::min(bounds.flux, row.luminance) : dr::Infinity<float>;
+        check(power);
+        if (!finite || !(power > 0)) {
             m_only_hit = by_plugin; // black as far as the quadrature saw
             return;
         }
@@ -553,11 +599,18 @@ private:
         m_table.bounds.push_back(bounds);
     }
 
+    /// Stands for a power that could not be found, and is too small to count
+    static constexpr float kUnknownPower = std::numeric_limits<float>::min();
+
     const Scene *m_scene = nullptr;
     Table m_table;
     /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
     bool m_only_hit    = false;
+    /// Lights that \ref check noted, and the index of the first one's emitter
+    uint32_t m_invalid = 0, m_first_invalid = 0;
+
+    static constexpr const char *ClassName = "LightTable"; // for log messages
 };
 
 } // namespace manylights

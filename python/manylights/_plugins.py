@@ -9,10 +9,10 @@ from pathlib import Path
 #: The only Mitsuba release the compiled plugins fit: its C++ interface changes between releases.
 REQUIRED_MITSUBA = "3.9.1"
 
-#: Every installation has at least this plugin.
-MAIN_PLUGIN = "manylights_direct"
+#: What every installation has.
+PLUGINS = ("manylights_direct", "manylights_volpath")
 
-#: Names a folder to search before the package: for developers, the build tree.
+#: Names the folder to use instead of the package's: for developers, the build tree.
 OVERRIDE = "MANYLIGHTS_PLUGIN_DIR"
 
 
@@ -21,19 +21,22 @@ def plugin_dir() -> str:
 
     An editable installation spreads the package over two folders, the sources and the build, so
     each entry of the package's path is tried. The environment variable ``MANYLIGHTS_PLUGIN_DIR``
-    comes first where it is set.
+    replaces them where it is set.
 
     Raises:
-        ImportError: no folder holds the compiled plugin; the text says how to build it.
+        ImportError: no folder holds the compiled plugins; the text says how to build them.
     """
-    candidates = _candidates()
-    for folder in candidates:
-        if _holds_plugin(folder / "plugins"):
+    override = os.environ.get(OVERRIDE)
+    package = sys.modules["manylights"].__path__
+    folders = [Path(entry).resolve() for entry in ([override] if override else package)]
+    for folder in folders:
+        if not _missing(folder):
             return str(folder)
-    searched = ", ".join(str(folder / "plugins") for folder in candidates)
+    named = f"{OVERRIDE}={override}: " if override else ""
+    searched = "; ".join(f"no {', '.join(_missing(f))} in {f / 'plugins'}" for f in folders)
     raise ImportError(
-        f"manylights: the compiled plugin {MAIN_PLUGIN} is missing (searched {searched}). "
-        "Build it with: pip install --force-reinstall --no-deps manylights, "
+        f"manylights: {named}compiled plugins are missing ({searched}). "
+        "Build them with: pip install --force-reinstall --no-deps manylights, "
         "or in a checkout: pip install -e ."
     )
 
@@ -51,18 +54,14 @@ def register() -> None:
         resolver.append(folder)
 
 
-def _candidates() -> list[Path]:
-    """Folders that may hold ``plugins/``, the preferred one first."""
-    folders = [Path(entry) for entry in sys.modules["manylights"].__path__]
-    override = os.environ.get(OVERRIDE)
-    if override:
-        folders.insert(0, Path(override))
-    return [folder.resolve() for folder in folders]
-
-
-def _holds_plugin(folder: Path) -> bool:
-    names = (f"{MAIN_PLUGIN}{suffix}" for suffix in (".so", ".dylib", ".dll"))
-    return any((folder / name).is_file() for name in names)
+def _missing(folder: Path) -> list[str]:
+    """Return the names of the plugins that are not in ``folder/plugins``."""
+    suffixes = (".so", ".dylib", ".dll")
+    return [
+        name
+        for name in PLUGINS
+        if not any((folder / "plugins" / f"{name}{suffix}").is_file() for suffix in suffixes)
+    ]
 
 
 def _import_mitsuba():
