@@ -1,0 +1,1 @@
+"""Stability: scenes where methods fail, with what keeps them from failing."""

@@ -1,0 +1,96 @@
+"""Renders the cases: single samples for their distribution, and means with their references."""
+
+from __future__ import annotations
+
+import functools
+
+import mitsuba as mi
+import numpy as np
+
+from tests import closed_form
+from tests import statistics_tools as tools
+from tests.references import ERROR, make_reference, planned_images, set_power_weights
+from tests.stability.cases import CASES
+
+TAIL_SIZE, TAIL_SEEDS = 256, 16
+"""A million single samples: pixels of images with one sample per pixel."""
+MEAN_SIZE = 16
+BLOCK = 4
+"""Means are compared over squares of that many pixels."""
+
+
+def load(description, size):
+    """The scene of a dictionary, with a film of size x size pixels."""
+    description["sensor"]["film"] |= {"width": size, "height": size}
+    return mi.load_dict(description)
+
+
+def integrator(name, **parameters):
+    """The integrator under test for a case."""
+    parameters = {**CASES[name].parameters, **parameters}
+    kind = "manylights_volpath" if "max_depth" in parameters else "manylights_direct"
+    return mi.load_dict({"type": kind, **parameters})
+
+
+def single_samples(name, seeds=TAIL_SEEDS, **parameters):
+    """Brightness of single samples of a case, (seeds, pixels)."""
+    scene = load(CASES[name].scene(), TAIL_SIZE)
+    images = tools.render_seeds(scene, integrator(name, **parameters), spp=1, seeds=range(seeds))
+    return images.mean(axis=-1).reshape(seeds, -1)
+
+
+def images(name, error=ERROR["tested"], **parameters):
+    """Images whose mean has about that relative standard error."""
+    scene = load(CASES[name].scene(), MEAN_SIZE)
+    return planned_images(scene, integrator(name, **parameters), error, first_seed=0)
+
+
+def plain_image(description, order=4):
+    """Expected image of a diffuse floor under points and spots, without Mitsuba."""
+    size = description["sensor"]["to_world"].matrix
+    centre = np.array(description["floor"]["to_world"].matrix)[:3, 3]
+    nodes = (np.arange(MEAN_SIZE * order) + 0.5) / (MEAN_SIZE * order)
+    x, y = np.meshgrid(2 * nodes - 1, 1 - 2 * nodes)
+    half = np.linalg.norm(np.array(size)[:3, 0])
+    points = np.stack([half * x, half * y, 0 * x], axis=-1)
+    lights = [
+        closed_form_light(light, centre) for key, light in description.items() if "light" in key
+    ]
+    albedo = description["floor"]["bsdf"]["reflectance"]["value"]
+    radiance = closed_form.reflected_radiance(points, lights, albedo)
+    return radiance.reshape(MEAN_SIZE, order, MEAN_SIZE, order, 3).mean(axis=(1, 3))
+
+
+def closed_form_light(light, centre):
+    """A point or spot of a scene's dictionary, its position relative to the centre."""
+    if light["type"] == "point":
+        place = np.subtract(light["position"], centre)
+        return closed_form.Light(tuple(place), tuple(light["intensity"]["value"]))
+    frame = np.array(light["to_world"].matrix)
+    return closed_form.Light(
+        tuple(frame[:3, 3] - centre),
+        tuple(light["intensity"]["value"]),
+        tuple(frame[:3, 2]),
+        light["cutoff_angle"],
+        light["beam_width"],
+    )
+
+
+@functools.cache
+def reference_images(name, variant):
+    """Images of the same mean: a closed form, or Mitsuba's emitters one by one, or `volpath`."""
+    if CASES[name].plain:
+        return plain_image((CASES[name].same_as or CASES[name].scene)())[np.newaxis]
+    before = mi.variant()
+    mi.set_variant(variant)
+    try:
+        case = CASES[name]
+        scene = load((case.same_as or case.scene)(), MEAN_SIZE)
+        if "max_depth" in case.parameters:
+            set_power_weights(scene)
+            known, error = mi.load_dict({"type": "volpath", **case.parameters}), ERROR["uniform"]
+        else:
+            known, error = make_reference("exhaustive"), ERROR["exhaustive"]
+        return planned_images(scene, known, error, first_seed=100_000)
+    finally:
+        mi.set_variant(before)

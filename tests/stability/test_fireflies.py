@@ -1,0 +1,45 @@
+"""The tail of the distribution of samples: how bright rare samples get.
+
+For each case the 99.99th percentile q of a sample is estimated with all lights as candidates,
+resampled like the default's. A firefly is a sample of the default that is brighter than `tail` q,
+with `tail` = 10 unless the case says why not. It must not be more frequent than samples above q
+are in that reference: 1 in 10,000, tested with the binomial distribution. The maximum is listed in
+README.md: it grows with the number of samples, and no test is made of it.
+"""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from tests.stability import samples
+from tests.stability.cases import CASES
+from tests.statistics_tools import SIGNIFICANCE
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+RARE = 1e-4
+REFERENCE_SEEDS = 2
+
+
+def assert_no_fireflies(values, reference, tail):
+    """Samples beyond `tail` times the reference's 99.99th percentile are at most as rare."""
+    limit = tail * np.quantile(reference, 1 - RARE)
+    count = int((values > limit).sum())
+    allowed = int(stats.binom.isf(SIGNIFICANCE, values.size, RARE))
+    assert count <= allowed, f"{count} of {values.size} samples above {limit:g}, {allowed} allowed"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_fireflies(llvm, name):
+    """The tail of the default is at most that of exhaustive resampling times a constant."""
+    values = samples.single_samples(name)
+    reference = samples.single_samples(name, REFERENCE_SEEDS, method="exhaustive")
+    assert_no_fireflies(values, reference, CASES[name].tail)
+
+
+def test_fireflies_are_found(llvm):
+    """One descent of the tree where the default has eight does not pass."""
+    reference = samples.single_samples("spots-5", REFERENCE_SEEDS, method="exhaustive")
+    values = samples.single_samples("spots-5", method="tree")
+    with pytest.raises(AssertionError, match="allowed"):
+        assert_no_fireflies(values, reference, CASES["spots-5"].tail)
