@@ -101,7 +101,7 @@ def interrupt(variant, name, spp, after):
 def test_ctrl_c_stops_a_scalar_render(scalar, name):
     """It ends soon, with the exception that Python programs expect, as with Mitsuba's own."""
     seconds, said = interrupt(scalar, name, MINUTES, after=0.5)
-    assert said.endswith("interrupted")
+    assert "interrupted" in said.splitlines()
     assert seconds < SOON
 
 
@@ -109,7 +109,7 @@ def test_ctrl_c_stops_a_scalar_render(scalar, name):
 def test_ctrl_c_is_heeded_after_a_kernel(llvm, name):
     """A kernel that runs cannot be stopped, nor can Mitsuba's own: the exception comes after it."""
     _, said = interrupt(llvm, name, 2**14, after=0.1)
-    assert said.endswith("interrupted")
+    assert "interrupted" in said.splitlines()
 
 
 @with_mitsubas

@@ -65,21 +65,27 @@ public:
         LightTableReader reader;
         reader.m_scene       = scene;
         const auto &emitters = scene->emitters();
-        for (const auto &emitter : emitters)
-            reader.m_table.beams |= is_beam(emitter.get());
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
+        if (!reader.m_table.beams)
+            reader.take_lobes_for_cosines();
         reader.estimate_unknown_powers();
         reader.warn_of_invalid_lights();
         return std::move(reader.m_table);
     }
 
 private:
-    static bool is_beam(const Emitter *emitter) {
-        if (emitter->class_name() != "SpotLight")
-            return false;
-        const Float *cutoff = ParameterReader(emitter).find<Float>("cutoff_angle");
-        return cutoff && dr::deg_to_rad(read_scalar(*cutoff)) < kWidestBeam;
+    /// Without narrow spots: unit axes, and the weights of spots (see LightBounds)
+    void take_lobes_for_cosines() {
+        for (size_t i = 0; i < m_table.rows.size(); ++i) {
+            LightBounds &bounds = m_table.bounds[i];
+            const LightRow &row = m_table.rows[i];
+            float length = std::hypot(bounds.axis[0], bounds.axis[1], bounds.axis[2]);
+            for (float &coordinate : bounds.axis)
+                coordinate /= length > 0 ? length : 1.f;
+            if ((row.tag & kTagKindMask) == (uint32_t) LightKind::Spot)
+                bounds.flux = std::sqrt(bounds.flux * 4 * dr::Pi<float> * row.luminance);
+        }
     }
 
     void add(const Emitter *emitter, uint32_t index) {
@@ -171,19 +177,15 @@ private:
 
         LightBounds bounds = point_bounds(row.geometry);
         // Uniform up to the middle of the transition
-        float axis_length =
-            m_table.beams ? .5f + .5f * std::cos(.5f * (std::min(beam, cutoff) + cutoff))
-                          : 1.f;
+        float mean_cosine = .5f + .5f * std::cos(.5f * (std::min(beam, cutoff) + cutoff));
         for (int i = 0; i < 3; ++i)
-            bounds.axis[i] = axis_length * row.geometry[3 + i];
+            bounds.axis[i] = mean_cosine * row.geometry[3 + i];
         // (1 - cos) as 2 sin^2, without cancellation
         float sin_beam   = std::sin(.5f * std::min(beam, cutoff)),
               sin_cutoff = std::sin(.5f * cutoff);
         float flux       = 2 * dr::Pi<float> * e.luminance *
                            (sin_beam * sin_beam + sin_cutoff * sin_cutoff);
-        // sqrt(flux * 4 pi * peak), see LightBounds
-        bounds.flux =
-            m_table.beams ? flux : std::sqrt(flux * 4 * dr::Pi<float> * e.luminance);
+        bounds.flux      = flux;
         add_light(row, bounds);
     }
 
@@ -566,13 +568,13 @@ private:
     }
 
     /// Set the emission axis to the direction of u x v; returns its length
-    float set_axis(LightBounds &bounds, const float u[3], const float v[3]) const {
+    static float set_axis(LightBounds &bounds, const float u[3], const float v[3]) {
         float n[3]   = { u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
                          u[0] * v[1] - u[1] * v[0] };
         float length = std::hypot(n[0], n[1], n[2]);
-        float scale  = m_table.beams ? 2.f / 3.f : 1.f; // mean cosine of a cosine lobe
+        constexpr float mean_cosine = 2.f / 3.f;
         for (int i = 0; i < 3; ++i)
-            bounds.axis[i] = length > 0 ? scale * n[i] / length : 0;
+            bounds.axis[i] = length > 0 ? mean_cosine * n[i] / length : 0;
         return length;
     }
 
@@ -595,6 +597,8 @@ private:
             m_only_hit = by_plugin; // black as far as the quadrature saw
             return;
         }
+        m_table.beams |= (row.tag & kTagKindMask) == (uint32_t) LightKind::Spot &&
+                         row.geometry[6] < kWidestBeam;
         m_table.rows.push_back(row);
         m_table.bounds.push_back(bounds);
     }

@@ -21,9 +21,6 @@ using Int4   = dr::Packet<int32_t, 4>;
 constexpr uint32_t kBins = 16;
 /// Below this depth ranges are halved; it bounds the recursion of degenerate inputs
 constexpr uint32_t kMaxCostDepth = 64;
-/// Variance that coincident lights are given, as a fraction of the squared diagonal of
-/// the scene's lights: keeps 1/distance^2 finite whatever the unit of length
-constexpr double kMinVariance = 1e-12;
 /// Subtrees of more lights are built by tasks of their own
 constexpr uint32_t kTaskLights = 1 << 14;
 
@@ -141,24 +138,17 @@ struct Node {
 class Builder {
 public:
     explicit Builder(const std::vector<LightBounds> &lights) : m_items(lights.size()) {
-        double flux = 0, diagonal2 = 0;
-        Bin all;
+        double flux = 0;
         for (uint32_t i = 0; i < (uint32_t) lights.size(); ++i) {
             m_items[i] = make_item(lights[i], i);
-            all.add(m_items[i]);
             m_centroids.add(m_items[i]);
             flux += lights[i].flux;
         }
-        for (int i = 0; i < 3; ++i) {
-            double extent = std::max(0.0, (double) all.high[i] - all.low[i]);
-            diagonal2 += extent * extent;
-        }
-        m_min_variance = (float) std::max(kMinVariance * diagonal2, (double) 1e-20f);
         for (size_t i = 0; i < lights.size(); ++i) {
             Item &item = m_items[i];
             // A positive weight is a promise that the light can be chosen
             item.low[3]  = std::max((float) (lights[i].flux / flux), FLT_MIN);
-            item.high[3] = std::max(lights[i].variance, m_min_variance);
+            item.high[3] = lights[i].variance;
             item.weight =
                 Float4(lights[i].axis[0], lights[i].axis[1], lights[i].axis[2], 1.f) *
                 (item.low[3] * kFluxScale);
@@ -440,7 +430,6 @@ private:
     std::vector<Item> m_items;
     std::vector<Node> m_nodes;
     Centroids m_centroids;
-    float m_min_variance = 0;
 };
 
 } // namespace

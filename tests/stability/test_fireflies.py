@@ -5,6 +5,9 @@ resampled like the default's. A firefly is a sample of the default that is brigh
 with `tail` = 10 unless the case says why not. It must not be more frequent than samples above q
 are in that reference: 1 in 10,000, tested with the binomial distribution. The maximum is listed in
 README.md: it grows with the number of samples, and no test is made of it.
+
+The variance of a sample has a limit, too, for each case: it tells when a cure stops working that
+leaves mean and tail alone.
 """
 
 import numpy as np
@@ -29,12 +32,22 @@ def assert_no_fireflies(values, reference, tail):
     assert count <= allowed, f"{count} of {values.size} samples above {limit:g}, {allowed} allowed"
 
 
+def assert_little_variance(values, limit):
+    """The relative variance, one number for each seed, is not significantly above the limit."""
+    relative = values.var(axis=1) / (values.mean() or 1) ** 2
+    if relative.mean() <= limit:
+        return
+    p = stats.ttest_1samp(relative, limit, alternative="greater").pvalue
+    assert p >= SIGNIFICANCE, f"relative variance {relative.mean():.3g}, {limit:.3g} allowed"
+
+
 @pytest.mark.parametrize("name", CASES)
-def test_no_fireflies(llvm, name):
-    """The tail of the default is at most that of exhaustive resampling times a constant."""
+def test_distribution_of_samples(llvm, name):
+    """Bright samples are as rare as in exhaustive resampling; the variance is what it was."""
     values = samples.single_samples(name)
     reference = samples.single_samples(name, REFERENCE_SEEDS, method="exhaustive")
     assert_no_fireflies(values, reference, CASES[name].tail)
+    assert_little_variance(values, CASES[name].variance)
 
 
 def test_fireflies_are_found(llvm):
@@ -43,3 +56,5 @@ def test_fireflies_are_found(llvm):
     values = samples.single_samples("spots-5", method="tree")
     with pytest.raises(AssertionError, match="allowed"):
         assert_no_fireflies(values, reference, CASES["spots-5"].tail)
+    with pytest.raises(AssertionError, match="variance"):
+        assert_little_variance(values, CASES["spots-5"].variance)
