@@ -37,7 +37,7 @@ class Case:
     black: bool = False
     """Is the image exactly zero?"""
     slow: bool = False
-    """Does the comparison of means take more than ten seconds?"""
+    """Do its tests take more than ten seconds?"""
     plain: bool = True
     """Is it a diffuse floor under points and spots, which has a closed form?"""
 
@@ -121,8 +121,8 @@ def lamp(to_world, radiance, kind="rectangle", **more):
 def in_emitter_plane():
     """Lamps flush with the floor all around the receiver, and fewer lights above."""
     generator = rng()
-    places = generator.uniform(-3, 3, (400, 2))
-    places = places[np.abs(places).max(axis=1) > 0.35][:150]
+    places = generator.uniform(-1, 1, (100, 2))
+    places = places[np.abs(places).max(axis=1) > 0.35][:60]
     flush = [lamp(transform().translate([*map(float, p), 0]).scale(0.04), 50.0) for p in places]
     return scene(flush + points(20), half=20)
 
@@ -245,8 +245,8 @@ def bright_far(count=10_000):
 def behind_wall():
     """A wall hides nine of ten lights, which are the brighter ones."""
     generator = rng()
-    hidden = generator.uniform((0.6, -2, 0.5), (2, 2, 2), (450, 3))
-    seen = generator.uniform((-2, -2, 0.5), (-0.6, 2, 2), (50, 3))
+    hidden = generator.uniform((0.6, -2, 0.5), (2, 2, 2), (225, 3))
+    seen = generator.uniform((-2, -2, 0.5), (-0.6, 2, 2), (25, 3))
     wall = {
         "type": "rectangle",
         "to_world": transform().translate([0.4, 0, 2]).rotate([0, 1, 0], 90).scale(6),
@@ -463,7 +463,7 @@ def units(scale):
 
 CASES = {
     "in-emitter-plane": Case(
-        "150 lamps in the plane of the receiver", in_emitter_plane, plain=False, variance=0.015
+        "60 lamps in the plane of the receiver", in_emitter_plane, plain=False, variance=0.015
     ),
     "on-emitter": Case(
         "the receiver is made of 512 lamps", on_emitter, plain=False, variance=0.0062
@@ -571,10 +571,12 @@ CASES = {
         variance=0.81,
     ),
     "small-units": Case(
-        "lengths of 1e-4", units(1e-4), same_as=units(1.0), plain=False, variance=0.087
+        "lengths of 1e-4", units(1e-4), same_as=units(1.0), slow=True, plain=False, variance=0.087
     ),
     "large-units": Case(
-        "lengths of 1e5", units(1e5), same_as=units(1.0), plain=False, variance=0.087
+        "lengths of 1e5", units(1e5), same_as=units(1.0), slow=True, plain=False, variance=0.087
     ),
     "wide-filter": Case("a filter wider than a pixel", wide_filter, plain=False, variance=0.0045),
 }
+
+QUICK = [name for name, case in CASES.items() if not case.slow]

@@ -6,9 +6,10 @@ import pytest
 from scipy import stats
 
 from tests import statistics_tools as tools
+from tests.path_references import quick_and_slow
 from tests.references import reference_variant
 from tests.stability import samples
-from tests.stability.cases import CASES, units
+from tests.stability.cases import CASES, QUICK, units
 
 pytestmark = pytest.mark.usefixtures("plugin")
 
@@ -24,13 +25,7 @@ def assert_mean(name, variant, images):
     tools.assert_same_mean(images, reference, tile=samples.BLOCK, label=f"{name}, {variant}")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[pytest.mark.slow] if case.slow else [])
-        for name, case in CASES.items()
-    ],
-)
+@pytest.mark.parametrize("name", quick_and_slow(CASES, QUICK))
 def test_mean_equals_reference(llvm, name):
     """The default of the plugin in llvm_ad_rgb."""
     assert_mean(name, llvm, samples.images(name))
@@ -109,7 +104,7 @@ def compare_noise(a, b):
     return result.pvalue, visible
 
 
-@pytest.mark.parametrize("scale", UNITS)
+@pytest.mark.parametrize("scale", quick_and_slow(UNITS, (UNITS[0], UNITS[-1])))
 def test_noise_does_not_depend_on_units(llvm, scale):
     """The same scene in other units of length has the same relative variance."""
     p, visible = compare_noise(noise(scale), noise(1.0))

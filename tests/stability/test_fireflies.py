@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.path_references import quick_and_slow
 from tests.stability import samples
-from tests.stability.cases import CASES
+from tests.stability.cases import CASES, QUICK
 from tests.statistics_tools import SIGNIFICANCE
 
 pytestmark = pytest.mark.usefixtures("plugin")
@@ -41,7 +42,7 @@ def assert_little_variance(values, limit):
     assert p >= SIGNIFICANCE, f"relative variance {relative.mean():.3g}, {limit:.3g} allowed"
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", quick_and_slow(CASES, QUICK))
 def test_distribution_of_samples(llvm, name):
     """Bright samples are as rare as in exhaustive resampling; the variance is what it was."""
     values = samples.single_samples(name)

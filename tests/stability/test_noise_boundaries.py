@@ -54,7 +54,7 @@ def largest_step(values):
 
 @pytest.mark.parametrize(
     "parameters",
-    [{}, {"splitting_rate": 0.25}, {"method": "talk"}],
+    [{}, {"splitting_rate": 0.25}, pytest.param({"method": "talk"}, marks=pytest.mark.slow)],
     ids=str,
 )
 def test_noise_has_no_step_with_stochastic_splitting(llvm, parameters):
