@@ -83,7 +83,7 @@ def test_furnace_filled_with_white_medium(llvm, medium):
     filled_furnace(medium)
 
 
-@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["chromatic", "smoke"]))
+@pytest.mark.parametrize("medium", quick_and_slow(path_scenes.WHITE_MEDIA, ["smoke"]))
 def test_furnace_filled_with_white_medium_in_scalar_variant(scalar, medium):
     """The same in scalar_rgb."""
     filled_furnace(medium)

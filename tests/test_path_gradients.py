@@ -172,7 +172,8 @@ def cases():
     return [pytest.param(case, marks=marks.get(case, [pytest.mark.slow])) for case in CASES]
 
 
-@pytest.mark.parametrize("case", cases())
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_gradients_equal_finite_differences(case):
     """Reflectance, roughness, emission, extinction and albedo of a medium."""
     tools.assert_same_mean(plugin_gradients(case), differences(case), bias=BIAS[case], label=case)
@@ -190,7 +191,8 @@ def test_gradients_equal_those_of_mitsuba(case):
     tools.assert_same_mean(found, expected[..., right], bias=2 * BIAS[case], label=case)
 
 
-@pytest.mark.parametrize("case", cases())
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_planted_bias_of_gradients_is_found(case):
     """Each derivative alone, too large or too small."""
     found, expected = plugin_gradients(case), differences(case)

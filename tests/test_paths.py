@@ -38,11 +38,9 @@ llvm_first = pytest.mark.parametrize(
 QUICK = (
     "gallery",
     "mirrors",
-    "fog-chromatic",
     "smoke",
     "camera-inside",
     "points-in-bubble",
-    "nested",
     "room",
     "environment",
 )
@@ -402,7 +400,7 @@ PLANTED = {
     "phase-hg-backward": ("phase-hg-backward", ("g",), 0.85),
     "phase-blendphase": ("phase-blendphase", ("weight",), 3),
 }
-QUICK_PLANTED = ("light-surfaces", "extinction-fog")
+QUICK_PLANTED = ("extinction-fog",)
 
 
 def planted_images(name, description):

@@ -13,6 +13,7 @@ import pytest
 from tests import closed_form, light_scenes
 from tests import statistics_tools as tools
 from tests.conftest import require_variant
+from tests.path_references import quick_and_slow
 from tests.references import ERROR, planned_images, reference_images, reference_variant
 
 pytestmark = pytest.mark.usefixtures("plugin")
@@ -58,6 +59,9 @@ SUBSET = (
 SPECTRAL_SUBSET = tuple(
     name for name in SUBSET if name not in SLOW_SCENES and not name.startswith("mesh")
 )
+
+# The others take up to ten seconds each.
+QUICK_SPECTRAL = [name for name in SPECTRAL_SUBSET if not name.startswith("material-")]
 
 # One-factor variations of the parameters, then combinations of extremes.
 PARAMETERS = (
@@ -123,7 +127,10 @@ THREE_KINDS = ("exhaustive", "uniform", "power")
 
 
 @pytest.mark.parametrize(
-    "name", [name for name in light_scenes.SCENES if reference_kinds(name, THREE_KINDS)[1:]]
+    "name",
+    quick_and_slow(
+        [name for name in light_scenes.SCENES if reference_kinds(name, THREE_KINDS)[1:]], SUBSET
+    ),
 )
 def test_references_agree(llvm, name):
     """The references have one mean; a disagreement would be the test's own mistake."""
@@ -132,10 +139,16 @@ def test_references_agree(llvm, name):
         tools.assert_same_mean(first, reference_images(name, kind, llvm), label=f"{name}, {kind}")
 
 
-@pytest.mark.parametrize("name", light_scenes.SCENES)
+@pytest.mark.parametrize("name", quick_and_slow(light_scenes.SCENES, SUBSET))
 def test_mean_equals_exhaustive_uniform_and_power_sampling(llvm, name):
     """All lights and materials in llvm_ad_rgb against all references."""
     assert_unbiased(name, llvm, THREE_KINDS)
+
+
+@pytest.mark.parametrize("name", [name for name in light_scenes.SCENES if name not in SUBSET])
+def test_mean_equals_exhaustive_sum(llvm, name):
+    """Against the sharpest reference those that take long with all three."""
+    assert_unbiased(name, llvm, ("exhaustive",))
 
 
 def scalar_scenes():
@@ -152,7 +165,7 @@ def test_mean_in_scalar_variant(scalar, name):
     assert_unbiased(name, scalar, ("exhaustive",))
 
 
-@pytest.mark.parametrize("name", SPECTRAL_SUBSET)
+@pytest.mark.parametrize("name", quick_and_slow(SPECTRAL_SUBSET, QUICK_SPECTRAL))
 def test_mean_in_spectral_variant(name):
     """Spectra with random wavelengths."""
     require_variant("scalar_spectral")
@@ -229,7 +242,12 @@ def test_mean_with_hidden_emitters(variant):
     assert not tools.compare_means(shown, gone).passes
 
 
-@pytest.mark.parametrize("name", ["material-roughconductor", "material-dielectric", "mixed"])
+@pytest.mark.parametrize(
+    "name",
+    quick_and_slow(
+        ["material-roughconductor", "material-dielectric", "mixed"], ["material-roughconductor"]
+    ),
+)
 def test_mean_of_stokes_vector(name):
     """The light keeps its polarization: all four Stokes components agree."""
     require_variant("llvm_ad_mono_polarized")
