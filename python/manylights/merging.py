@@ -308,8 +308,8 @@ class _Merging:
 
     def _lamp_of_object(self, key: str, mesh) -> Lamp | None:
         emitter = mesh.emitter()
-        parameters = mi.traverse(mesh)
-        known = (name in MESH_PARAMETERS or name.startswith(MESH_CHILDREN) for name in parameters)
+        names = mi.traverse(mesh).keys()
+        known = (name in MESH_PARAMETERS or name.startswith(MESH_CHILDREN) for name in names)
         if emitter is None or not all(known):
             return None
         radiance = _constant_radiance(emitter)
