@@ -109,9 +109,9 @@ def crowd():
 def test_rays_see_the_same_surfaces_with_the_same_radiance(any_variant):
     scene = crowd()
     merged = manylights.merge_emitters(scene)
-    # With and without flipped normals, face normals and texture; smooth meshes
-    assert sorted(len(ids) for ids in merged.merged.values()) == [2, 4, 4, 8, 8]
-    assert len(merged) == 1 + 5
+    # Flipped or with a texture or neither; meshes without texture coordinates
+    assert sorted(len(ids) for ids in merged.merged.values()) == [2, 4, 8, 12]
+    assert len(merged) == 1 + 4
     expected, found = seen(mi.load_dict(scene)), seen(mi.load_dict(merged))
     hits = np.count_nonzero(expected[:, -1])
     assert 50 < hits < 300 and np.count_nonzero(np.any(expected[:, 11:14] > 0, axis=1)) > 20
@@ -161,7 +161,6 @@ def test_means_are_those_of_separate_lamps_and_a_brighter_lamp_is_noticed(render
         {"type": "disk"},
         {"bsdf": diffuse(0.4, 0.4, 0.4)},
         {"flip_normals": True},
-        {"face_normals": True},
         {"interior": {"type": "homogeneous"}},
         {"silhouette_sampling_weight": 0.5},
         {"type": "ply", "filename": "nowhere.ply"},
@@ -175,11 +174,14 @@ def test_a_lamp_that_differs_stays_as_it_is(scalar, odd):
     assert merged["odd"] is scene["odd"] or merged["odd"] == scene["odd"]
 
 
-def test_meshes_with_attributes_stay(scalar):
+def test_meshes_with_attributes_stay(scalar, tmp_path):
     radiance = {"type": "mesh_attribute", "name": "face_color"}
     corners = light_scenes.triangles(2)
     colored = {f"m{i}": make_mesh(corners, radiance, np.ones((2, 3))) for i in range(2)}
     assert merged_ids({"type": "scene", **colored}) == []
+    make_mesh(corners, rgb([1, 1, 1]), np.ones((2, 3))).write_ply(str(tmp_path / "m.ply"))
+    file = lamp(0, 1.0, "ply", filename=str(tmp_path / "m.ply"))
+    assert merged_ids({"type": "scene", "a": file, "b": file}) == []
     painted = {f"m{i}": make_mesh(corners, rgb([1, 1, 1]), np.ones((2, 3))) for i in range(2)}
     assert merged_ids({"type": "scene", **painted}) == []
 
@@ -192,12 +194,25 @@ def test_meshes_of_the_same_bsdf_object_are_merged_and_of_others_not(scalar):
 
 
 def test_lamps_to_keep_and_lamps_that_others_refer_to_stay(scalar):
-    scene = {"type": "scene", **lamps(), "a": lamp(0, 1.0), "b": lamp(0, 1.0, id="named")}
+    green = diffuse(0, 0.5, 0)
+    scene = {"type": "scene", **lamps(bsdf=green)}
+    scene |= {"a": lamp(0, 1.0, bsdf=green), "b": lamp(0, 1.0, id="named", bsdf=green)}
+    assert merged_ids(scene) == [["a", "lamp_0", "lamp_1", "lamp_2", "named"]]
     assert merged_ids(scene, keep=("a", "named")) == [["lamp_0", "lamp_1", "lamp_2"]]
-    scene["a"]["material"] = diffuse(0, 0, 0)
-    scene["floor"] = {"type": "rectangle", "bsdf": {"type": "ref", "id": "a.material"}}
+    scene["floor"] = {"type": "rectangle", "bsdf": {"type": "ref", "id": "a.bsdf"}}
     assert merged_ids(scene, keep=("b",)) == [["lamp_0", "lamp_1", "lamp_2"]]
     mi.load_dict(manylights.merge_emitters(scene))
+
+
+def test_a_file_read_with_face_normals_is_not_joined_with_smooth_ones(scalar, tmp_path):
+    triangles, normals = light_scenes.octahedron(np.array([0, 0, 2]), 0.3)
+    path = str(tmp_path / "ball.ply")
+    make_mesh(triangles, rgb([1, 1, 1]), None, normals).write_ply(path)
+    files = {f"file_{i}": lamp(i, 1.0, "ply", filename=path, face_normals=i > 1) for i in range(4)}
+    scene = {"type": "scene", **files}
+    assert merged_ids(scene) == [["file_0", "file_1"], ["file_2", "file_3"]]
+    found = (seen(mi.load_dict(s)) for s in (scene, manylights.merge_emitters(scene)))
+    np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-6)
 
 
 def test_a_bsdf_shared_with_other_shapes_is_still_shared(scalar):
@@ -239,7 +254,8 @@ def test_integrators_of_mitsuba_are_refused(scalar, integrator):
 
 def test_nothing_is_merged_in_spectral_variants():
     require_variant("scalar_spectral")
-    scene = {"type": "scene", **lamps()}
+    grey = {f"grey_{i}": lamp(i, {"type": "uniform", "value": 2.5}) for i in range(2)}
+    scene = {"type": "scene", **lamps(), **grey}
     merged = manylights.merge_emitters(scene)
     assert merged.merged == {} and merged == scene
 

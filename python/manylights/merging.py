@@ -57,7 +57,7 @@ class Lamp:
     Attributes:
         key: name of the shape among the scene's properties.
         id: what users call it.
-        mesh: the shape.
+        mesh: the shape, or the properties to make it of, without BSDF and emitter.
         radiance: three channels.
         materials: BSDF, media and textures by the names that a mesh expects.
         uses: indices of the nodes that became ``materials``.
@@ -71,16 +71,21 @@ class Lamp:
     uses: set[int]
 
     def kind(self) -> tuple:
-        """Return what lamps of one mesh have in common."""
+        """Return what lamps of one mesh have in common.
+
+        Not ``face_normals``: after loading these meshes just have no vertex normals.
+        """
         mesh = self.mesh
-        materials = sorted((name, id(value)) for name, value in self.materials.items())
         return (
-            tuple(materials),
+            self.look(),
             mesh.has_vertex_normals(),
             mesh.has_vertex_texcoords(),
-            mesh.has_face_normals(),
             mesh.has_flipped_normals(),
         )
+
+    def look(self) -> tuple:
+        """Return the materials as something to compare."""
+        return tuple(sorted((name, id(value)) for name, value in self.materials.items()))
 
 
 def merge_emitters(scene: dict, keep=()) -> MergedScene:
@@ -143,7 +148,7 @@ def merge_parsed(config, state) -> dict[str, list[str]]:
     if not _all_ours(state) or any(node.props.plugin_name() == "aov" for node in state.nodes):
         return {}
     _prepare(config, state)
-    merging = _Merging(state, _shapes_in_other_parts(state))
+    merging = _Merging(state, ())
     for lamps in merging.groups.values():
         for lamp in lamps:
             del state.root.props[lamp.key]
@@ -194,15 +199,6 @@ def _referred_shapes(state, indices: dict[str, int]) -> set[str]:
     return {path.split(".")[0] for path in paths}
 
 
-def _shapes_in_other_parts(state) -> set[str]:
-    """Return the keys of what is used by the scene and by a part of it."""
-    used = set()
-    for node in list(state.nodes)[1:]:
-        values = (value for _, value in node.props.items())
-        used |= {value.index() for value in values if isinstance(value, Reference)}
-    return {key for key, _ in state.root.props.items() if _index(state.root.props, key) in used}
-
-
 def _shared_objects(merging: _Merging, rest: dict, definitions: dict) -> dict[int, object]:
     """Return the objects in merged meshes that entries of the scene define, by node."""
     shared = {}
@@ -241,14 +237,14 @@ class _Merging:
         self.groups, self.meshes, self.used = {}, {}, set()
         if "spectral" in mi.variant():
             return
-        kinds: dict[tuple, list[Lamp]] = {}
-        for key, value in state.root.props.items():
-            lamp = None if key in keep else self._lamp(key, value)
-            if lamp is not None and lamp.id not in keep:
-                kinds.setdefault(lamp.kind(), []).append(lamp)
-        for lamps in kinds.values():
-            if len(lamps) > 1:
-                self._merge(lamps)
+        items = [item for item in state.root.props.items() if item[0] not in keep]
+        lamps = [self._try(self._lamp, *item) for item in items]
+        lamps = [lamp for lamp in lamps if lamp is not None and lamp.id not in keep]
+        # A file is not read for nothing if its lamp is the only one
+        lamps = [lamp for group in _groups(lamps, Lamp.look) for lamp in group]
+        lamps = [lamp for lamp in lamps if self._try(self._load, lamp)]
+        for group in _groups(lamps, Lamp.kind):
+            self._merge(group)
 
     def _merge(self, lamps: list[Lamp]) -> None:
         name = f"merged_{len(lamps)}_emitters"
@@ -268,43 +264,45 @@ class _Merging:
             values = (value for _, value in self.state.nodes[index].props.items())
             self._use({value.index() for value in values if isinstance(value, Reference)})
 
+    def _try(self, function, *arguments):
+        """Return what a function does, None where Mitsuba cannot; it says so when it loads."""
+        try:
+            return function(*arguments)
+        except RuntimeError:
+            return None
+
     def _lamp(self, key: str, value) -> Lamp | None:
         """Return an entry of the scene as a lamp, None if it is none or cannot be merged."""
-        try:
-            if isinstance(value, mi.Mesh):
-                return self._lamp_of_object(key, value)
-            if isinstance(value, Reference):
-                return self._lamp_of_node(key, self.state.nodes[value.index()])
-        except RuntimeError:
-            # Mitsuba says what is wrong when it makes the scene
-            pass
+        if isinstance(value, mi.Mesh):
+            return self._lamp_of_object(key, value)
+        if isinstance(value, Reference):
+            return self._lamp_of_node(key, self.state.nodes[value.index()].props)
         return None
 
-    def _lamp_of_node(self, key: str, node) -> Lamp | None:
-        props = node.props
+    def _lamp_of_node(self, key: str, props) -> Lamp | None:
         plugin = props.plugin_name()
-        if plugin not in GEOMETRY:
+        emitters = [value for _, value in props.items() if self._is(value, "Emitter")]
+        if plugin not in GEOMETRY or len(emitters) != 1:
             return None
-        geometry, materials = mi.Properties(plugin), {}
-        radiance, uses = None, set()
+        radiance = self._radiance(emitters[0])
+        geometry, materials, uses = mi.Properties(plugin), {}, set()
         for name, value in props.items():
             if name in (*SHARED_GEOMETRY, *GEOMETRY[plugin]):
                 geometry[name] = value
-                continue
-            if self._is(value, mi.ObjectType.Emitter, mi.Emitter):
-                radiance = self._radiance(value)
-                continue
-            if self._is(value, mi.ObjectType.BSDF, mi.BSDF):
-                materials["bsdf"] = self._object(value)
-            elif self._is(value, mi.ObjectType.Medium, mi.Medium):
-                materials[name] = self._object(value)
-            else:
+            elif self._is(value, "BSDF") or self._is(value, "Medium"):
+                materials["bsdf" if self._is(value, "BSDF") else name] = self._object(value)
+                uses |= {value.index()} if isinstance(value, Reference) else set()
+            elif not self._is(value, "Emitter"):
                 return None
-            if isinstance(value, Reference):
-                uses.add(value.index())
         if radiance is None:
             return None
-        return Lamp(key, props.id() or key, self._make(geometry), radiance, materials, uses)
+        return Lamp(key, props.id() or key, geometry, radiance, materials, uses)
+
+    def _load(self, lamp: Lamp) -> bool:
+        """Make the mesh of a lamp; return whether all that it has can be merged."""
+        if isinstance(lamp.mesh, mi.Properties):
+            lamp.mesh = self._make(lamp.mesh)
+        return not lamp.mesh.has_mesh_attributes()
 
     def _lamp_of_object(self, key: str, mesh) -> Lamp | None:
         emitter = mesh.emitter()
@@ -320,10 +318,11 @@ class _Merging:
         materials = {name: part for name, part in materials.items() if part is not None}
         return Lamp(key, key, mesh, radiance, materials, set())
 
-    def _is(self, value, node_type, object_type) -> bool:
+    def _is(self, value, kind: str) -> bool:
+        """Is this part of a shape, a node or an object, an "Emitter", a "BSDF" or a "Medium"?"""
         if isinstance(value, Reference):
-            return self.state.nodes[value.index()].type == node_type
-        return isinstance(value, object_type)
+            return self.state.nodes[value.index()].type == getattr(mi.ObjectType, kind)
+        return isinstance(value, getattr(mi, kind))
 
     def _radiance(self, value) -> np.ndarray | None:
         """Return the three channels that an emitter emits everywhere, None if it varies."""
@@ -331,7 +330,7 @@ class _Merging:
             props = self.state.nodes[value.index()].props
             color = props.get("radiance", None)
             plain = (props.plugin_name(), list(props.keys())) == ("area", ["radiance"])
-            if plain and isinstance(color, mi.ScalarColor3d) and "rgb" in mi.variant():
+            if plain and isinstance(color, mi.ScalarColor3d):
                 # The common case, ten times as fast as to make an emitter
                 return np.array(color, dtype=np.float32)
         return _constant_radiance(self._object(value))
@@ -357,6 +356,14 @@ class _Merging:
         state = mi.parser.ParserState()
         state.nodes.append(node)
         return mi.parser.instantiate(self.config, state)
+
+
+def _groups(lamps: list[Lamp], key) -> list[list[Lamp]]:
+    """Return the lamps that have something in common with others."""
+    found: dict[tuple, list[Lamp]] = {}
+    for lamp in lamps:
+        found.setdefault(key(lamp), []).append(lamp)
+    return [group for group in found.values() if len(group) > 1]
 
 
 def _constant_radiance(emitter) -> np.ndarray | None:
@@ -388,7 +395,6 @@ def _join(name: str, lamps: list[Lamp]):
     for key, value in lamps[0].materials.items():
         props[key] = value
     props["flip_normals"] = first.has_flipped_normals()
-    props["face_normals"] = first.has_face_normals()
     radiance = {"type": "mesh_attribute", "name": "face_color"}
     props["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
     counts = [lamp.mesh.face_count() for lamp in lamps]
