@@ -238,11 +238,11 @@ class _Merging:
         if "spectral" in mi.variant():
             return
         items = [item for item in state.root.props.items() if item[0] not in keep]
-        lamps = [self._try(self._lamp, *item) for item in items]
+        lamps = [_try(self._lamp, *item) for item in items]
         lamps = [lamp for lamp in lamps if lamp is not None and lamp.id not in keep]
         # A file is not read for nothing if its lamp is the only one
         lamps = [lamp for group in _groups(lamps, Lamp.look) for lamp in group]
-        lamps = [lamp for lamp in lamps if self._try(self._load, lamp)]
+        lamps = [lamp for lamp in lamps if _try(self._load, lamp)]
         for group in _groups(lamps, Lamp.kind):
             self._merge(group)
 
@@ -263,13 +263,6 @@ class _Merging:
         for index in new:
             values = (value for _, value in self.state.nodes[index].props.items())
             self._use({value.index() for value in values if isinstance(value, Reference)})
-
-    def _try(self, function, *arguments):
-        """Return what a function does, None where Mitsuba cannot; it says so when it loads."""
-        try:
-            return function(*arguments)
-        except RuntimeError:
-            return None
 
     def _lamp(self, key: str, value) -> Lamp | None:
         """Return an entry of the scene as a lamp, None if it is none or cannot be merged."""
@@ -356,6 +349,14 @@ class _Merging:
         state = mi.parser.ParserState()
         state.nodes.append(node)
         return mi.parser.instantiate(self.config, state)
+
+
+def _try(function, *arguments):
+    """Return what a function does, None where Mitsuba cannot; it says so when it loads."""
+    try:
+        return function(*arguments)
+    except RuntimeError:
+        return None
 
 
 def _groups(lamps: list[Lamp], key) -> list[list[Lamp]]:
