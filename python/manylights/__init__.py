@@ -14,7 +14,8 @@ path for the whole process and reads it whenever a scene asks for a plugin.
 
 ``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.scenes`` generates
 scenes; ``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose emitters by
-power, for comparisons.
+power, for comparisons. ``manylights.merge_emitters(description)`` makes scenes with thousands of
+separate lamps start in seconds.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ register()
 
 # These need the right Mitsuba, which register() checks.
 from manylights import scenes  # noqa: E402
+from manylights.merging import merge_emitters  # noqa: E402
 from manylights.power import power_sampling, power_weights  # noqa: E402
 
 __version__ = "0.1.0"
 __all__ = [
     "REQUIRED_MITSUBA",
     "__version__",
+    "merge_emitters",
     "plugin_dir",
     "power_sampling",
     "power_weights",

@@ -9,7 +9,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
-from manylights import integrators
+from manylights import integrators, merging
 from manylights.errors import UsageError, one_line
 from manylights.threads import threads_for_files
 
@@ -119,6 +119,13 @@ def instantiate(config, state):
     return scene
 
 
+def _merge_emitters(config, state) -> list[str]:
+    """Merge emissive meshes where that changes nothing but time, and say so."""
+    merged = merging.merge_parsed(config, state)
+    shapes = sum(len(ids) for ids in merged.values())
+    return [f"emitters: {shapes} meshes merged into {len(merged)}"] if merged else []
+
+
 def _check_images(files: list[Path]) -> None:
     """Read all OpenEXR files once.
 
@@ -170,4 +177,5 @@ def load(
         notes = integrators.choose(state, integrator, settings or {})
         integrators.fix_block_size(state)
         count = sum(node.type == mi.ObjectType.Integrator for node in state.nodes)
+        notes += _merge_emitters(config, state)
         return LoadedScene(instantiate(config, state), max(count, 1), notes, files)
