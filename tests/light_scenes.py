@@ -189,10 +189,18 @@ def triangle_colours(count=100, seed=5, total=150.0):
     return colours(count, np.random.default_rng(seed), total)
 
 
-def make_mesh(vertices, radiance, face_colours=None, vertex_normals=None, name="lamps"):
-    """A mesh of separate triangles (count, 3, 3) with an area emitter."""
+def make_mesh(
+    vertices, radiance, face_colours=None, vertex_normals=None, name="lamps", material=None
+):
+    """A mesh of separate triangles (count, 3, 3) with an area emitter, unless `radiance` is None.
+
+    The material is a dictionary, or that of Mitsuba's default.
+    """
     properties = mi.Properties()
-    properties["mesh_emitter"] = mi.load_dict(area(radiance))
+    if material is not None:
+        properties["mesh_bsdf"] = mi.load_dict(material)
+    if radiance is not None:
+        properties["mesh_emitter"] = mi.load_dict(area(radiance))
     count = len(vertices)
     mesh = mi.Mesh(
         name, 3 * count, count, has_vertex_normals=vertex_normals is not None, props=properties

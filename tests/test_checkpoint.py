@@ -175,9 +175,14 @@ def test_killed_renders_go_on_to_the_same_bits(tmp_path, variant, spp):
     status, log = finish(start(*arguments))
     assert status == 0 and "the render goes on from there" in log
     assert names(tmp_path) == {"out.exr", "out.png"}
-    whole = (arguments[0], tmp_path / "whole.exr", *arguments[2:])
+    assert_same_as_never_stopped(tmp_path, arguments)
+
+
+def assert_same_as_never_stopped(folder, arguments):
+    """The image of a command has the bits of the same command without interruption."""
+    whole = (arguments[0], folder / "whole.exr", *arguments[2:])
     assert finish(start(*whole))[0] == 0
-    assert pixels(tmp_path / "out.exr") == pixels(tmp_path / "whole.exr")
+    assert pixels(folder / "out.exr") == pixels(folder / "whole.exr")
 
 
 def test_kill_while_a_checkpoint_is_written_leaves_the_one_before(tmp_path):
@@ -190,9 +195,7 @@ def test_kill_while_a_checkpoint_is_written_leaves_the_one_before(tmp_path):
     status, log = finish(start(*arguments))
     assert status == 0 and "has 8 of 20 samples" in log
     assert names(tmp_path) == {"out.exr", "out.png"}
-    whole = (arguments[0], tmp_path / "whole.exr", *arguments[2:])
-    assert finish(start(*whole))[0] == 0
-    assert pixels(tmp_path / "out.exr") == pixels(tmp_path / "whole.exr")
+    assert_same_as_never_stopped(tmp_path, arguments)
 
 
 @pytest.mark.slow

@@ -98,16 +98,21 @@ def make_lights(seed, count, scale, decades, clusters, oriented, extended):
     return Lights(mean, flux, axis, variance, made_of)
 
 
-any_lights = st.builds(
-    make_lights,
-    seed=seeds,
-    count=st.integers(1, 200),
-    scale=st.sampled_from([1e-4, 1.0, 1e6]),
-    decades=st.sampled_from([0, 2, 24]),
-    clusters=st.sampled_from([0, 0, 1, 5]),
-    oriented=st.booleans(),
-    extended=st.booleans(),
-)
+def lights_of(count, clusters):
+    """Random lights of any scale and power, given strategies for their number and clusters."""
+    return st.builds(
+        make_lights,
+        seed=seeds,
+        count=count,
+        scale=st.sampled_from([1e-4, 1.0, 1e6]),
+        decades=st.sampled_from([0, 2, 24]),
+        clusters=clusters,
+        oriented=st.booleans(),
+        extended=st.booleans(),
+    )
+
+
+any_lights = lights_of(st.integers(1, 200), st.sampled_from([0, 0, 1, 5]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -397,16 +402,7 @@ def check_coincident_lights(look):
     assert np.abs(w / share - 1)[share > 1e-12].max() <= rounding(tree)
 
 
-generic_lights = st.builds(
-    make_lights,
-    seed=seeds,
-    count=st.integers(2, 200),
-    scale=st.sampled_from([1e-4, 1.0, 1e6]),
-    decades=st.sampled_from([0, 2, 24]),
-    clusters=st.just(0),
-    oriented=st.booleans(),
-    extended=st.booleans(),
-)
+generic_lights = lights_of(st.integers(2, 200), st.just(0))
 
 
 @quick_and_slow(100, 3000)

@@ -13,9 +13,11 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-from tests.light_scenes import area, diffuse, make_mesh, rgb, transform
+from tests.light_scenes import area, diffuse, make_mesh, octahedron, rgb, transform
 
 TINTS = np.array([[1.0, 0.8, 0.6], [0.6, 0.8, 1.0], [0.9, 0.9, 0.9]])
+BROWN = diffuse(0.6, 0.5, 0.4)
+"""The material of receivers, unless another one is what is hard."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def scene(lights, bsdf=None, half=20.0, **sensor):
     floor = {
         "type": "rectangle",
         "to_world": transform().scale(half),
-        "bsdf": bsdf or diffuse(0.6, 0.5, 0.4),
+        "bsdf": bsdf or BROWN,
     }
     return {"type": "scene", "sensor": camera(**sensor), "floor": floor, **lights}
 
@@ -127,29 +129,20 @@ def in_emitter_plane():
     return scene(flush + points(20), half=20)
 
 
-def ripples(cells=16, height=0.1, bsdf=None, radiance=2.0):
-    """A glowing mesh of hills and valleys whose triangles light each other."""
+def ripples(cells=16, height=0.1):
+    """Triangles of hills and valleys that face each other."""
     grid = np.linspace(-1, 1, cells + 1)
     x, y = np.meshgrid(grid, grid)
     z = height * np.cos(9 * x) * np.cos(7 * y)
     corner = np.stack([x, y, z], axis=-1)
     a, b, c, d = corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]
     triangles = np.concatenate([np.stack([a, b, c], -2), np.stack([a, c, d], -2)])
-    triangles = triangles.reshape(-1, 3, 3)
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(bsdf or diffuse(0.6, 0.5, 0.4))
-    properties["mesh_emitter"] = mi.load_dict(area(rgb([radiance] * 3)))
-    mesh = mi.Mesh("ripples", 3 * len(triangles), len(triangles), props=properties)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.ravel(triangles).astype(np.float32)
-    parameters["faces"] = np.arange(3 * len(triangles), dtype=np.uint32)
-    parameters.update()
-    return mesh
+    return triangles.reshape(-1, 3, 3)
 
 
 def on_emitter():
     """A receiver that is itself made of 512 lamps."""
-    lights = {"lamps": ripples()}
+    lights = {"lamps": make_mesh(ripples(), rgb([2.0] * 3), material=BROWN)}
     lights |= {f"point_{index}": light for index, light in enumerate(points(50))}
     return {"type": "scene", "sensor": camera(size=1.5), **lights}
 
@@ -380,20 +373,8 @@ def broken_triangles(broken=True):
 
 def coarse_ball():
     """An octahedron with the normals of a sphere, lit from the side."""
-    corners, normals = [], []
-    for signs in np.ndindex(2, 2, 2):
-        signs = 1 - 2 * np.array(signs)
-        triangle = np.eye(3) * signs[:, np.newaxis]
-        corners.append(triangle if signs.prod() > 0 else triangle[::-1])
-        normals.append(corners[-1])
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(diffuse(0.6, 0.5, 0.4))
-    ball = mi.Mesh("ball", 24, 8, has_vertex_normals=True, props=properties)
-    parameters = mi.traverse(ball)
-    parameters["vertex_positions"] = np.ravel(corners).astype(np.float32)
-    parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
-    parameters["faces"] = np.arange(24, dtype=np.uint32)
-    parameters.update()
+    corners, normals = octahedron(0, 1)
+    ball = make_mesh(corners, None, None, normals, "ball", BROWN)
     lights = points(300, low=(2, -2, -1), high=(4, 2, 1), total=100.0)
     lights = {f"light_{index}": light for index, light in enumerate(lights)}
     return {"type": "scene", "sensor": camera(size=1.6, origin=(0, 0, 5)), "ball": ball, **lights}

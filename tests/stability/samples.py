@@ -34,8 +34,13 @@ def integrator(name, **parameters):
 
 def single_samples(name, seeds=TAIL_SEEDS, **parameters):
     """Brightness of single samples of a case, (seeds, pixels)."""
-    scene = load(CASES[name].scene(), TAIL_SIZE)
-    images = tools.render_seeds(scene, integrator(name, **parameters), spp=1, seeds=range(seeds))
+    return brightness(CASES[name].scene(), integrator(name, **parameters), seeds)
+
+
+def brightness(description, integrator, seeds=TAIL_SEEDS):
+    """The same for any scene's dictionary."""
+    scene = load(description, TAIL_SIZE)
+    images = tools.render_seeds(scene, integrator, spp=1, seeds=range(seeds))
     return images.mean(axis=-1).reshape(seeds, -1)
 
 

@@ -89,10 +89,7 @@ UNITS = (1e-4, 1e-2, 1e2, 1e5)
 
 def noise(scale):
     """Relative variance of a sample in units of that scale, once for each seed."""
-    scene = samples.load(units(scale)(), samples.TAIL_SIZE)
-    integrator = mi.load_dict({"type": "manylights_direct"})
-    images = tools.render_seeds(scene, integrator, spp=1, seeds=range(samples.TAIL_SEEDS))
-    values = images.mean(axis=-1).reshape(samples.TAIL_SEEDS, -1)
+    values = samples.brightness(units(scale)(), mi.load_dict({"type": "manylights_direct"}))
     return values.var(axis=1) / values.mean(axis=1) ** 2
 
 
