@@ -77,12 +77,12 @@ try:
     dr.eval(image)
     dr.sync_thread()
 except KeyboardInterrupt:
-    print("interrupted", flush=True)
+    sys.exit(3)
 """
 
 
 def interrupt(variant, name, spp, after):
-    """Send SIGINT to a process that renders: the seconds until its end, and what it said."""
+    """Send SIGINT to a process that renders: seconds until its end, and if by KeyboardInterrupt."""
     process = start_python(INTERRUPTED, variant, name, spp, preexec_fn=heed_ctrl_c)
     try:
         while process.stdout.readline().strip() != "ready":
@@ -90,26 +90,26 @@ def interrupt(variant, name, spp, after):
         time.sleep(after)
         start = time.monotonic()
         process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=120)
     finally:
         process.kill()
-    assert process.returncode == 0, errors
-    return time.monotonic() - start, output.strip()
+    assert process.returncode in (0, 3), errors
+    return time.monotonic() - start, process.returncode == 3
 
 
 @with_mitsubas
 def test_ctrl_c_stops_a_scalar_render(scalar, name):
     """It ends soon, with the exception that Python programs expect, as with Mitsuba's own."""
-    seconds, said = interrupt(scalar, name, MINUTES, after=0.5)
-    assert "interrupted" in said.splitlines()
+    seconds, interrupted = interrupt(scalar, name, MINUTES, after=0.5)
+    assert interrupted
     assert seconds < SOON
 
 
 @pytest.mark.parametrize("name", ["direct", "manylights_direct"])
 def test_ctrl_c_is_heeded_after_a_kernel(llvm, name):
     """A kernel that runs cannot be stopped, nor can Mitsuba's own: the exception comes after it."""
-    _, said = interrupt(llvm, name, 2**14, after=0.1)
-    assert "interrupted" in said.splitlines()
+    _, interrupted = interrupt(llvm, name, 2**14, after=0.1)
+    assert interrupted
 
 
 @with_mitsubas
