@@ -75,6 +75,8 @@ public:
             rows[i].link                = m_tree.link[i];
             m_light_of[m_tree.order[i]] = i;
         }
+        m_view.node_links = dr::load<dr::DynamicArray<uint32_t>>(m_tree.node_link.data(),
+                                                                 m_tree.node_link.size());
         m_view.nodes = load(m_tree.wide.data(), m_tree.wide.size() * kWideNodeFloats);
         m_view.binary =
             load(m_tree.binary.data(), m_tree.binary.size() * kBinaryNodeFloats);

@@ -74,11 +74,11 @@ template <typename Float> struct SystematicCursor {
     using UInt32 = dr::uint32_array_t<Float>;
     using Mask   = dr::mask_t<Float>;
 
-    /// A node and the interval [lower, lower + width) of the leaves below it
+    /// A node and the interval [begin, begin + width) of the leaves below it, in points
     struct Place {
         UInt32 node;
-        Float lower, width;
-        DRJIT_STRUCT(Place, node, lower, width)
+        Float begin, width;
+        DRJIT_STRUCT(Place, node, begin, width)
     };
 
     /// Expected candidates K, offset u of the points, next point k
@@ -92,7 +92,7 @@ template <typename Float> struct SystematicCursor {
         : expected(expected), offset(u), k(0.f), trail0(root(0.f)), trail1(root(0.f)),
           last_leaf(kNone), visits(0) {}
 
-    Mask has_next() const { return holds(root(1.f), k); }
+    Mask has_next() const { return k + offset < expected; }
 
     template <typename Rng>
     Candidate<Float> next(const TreeView<Float> &tree, const Receiver<Float> &at,
@@ -105,14 +105,14 @@ template <typename Float> struct SystematicCursor {
         };
 
         // By rounding, a remembered node may miss the point by a hair: then start at the root
-        Mask remembered = trail0.width > 0.f && holds(trail0, k);
-        Descent d{ dr::select(remembered, trail0, root(1.f)),
+        Mask remembered = holds(trail0, k);
+        Descent d{ dr::select(remembered, trail0, root(expected)),
                    dr::select(remembered, trail1, root(0.f)),
                    root(0.f),
                    Float(0.f),
                    rng.template next_float<Float>(),
                    visits };
-        d.x = inside(((k + offset) / expected - d.place.lower) / d.place.width);
+        d.x = dr::clip((k + offset - d.place.begin) / d.place.width, 0.f, kBelowOne);
 
         loop(
             d, [](const Descent &s) { return (s.place.node & kLeafBit) == 0u; },
@@ -121,51 +121,50 @@ template <typename Float> struct SystematicCursor {
         visits = d.visits;
         trail0 = d.trail0;
         trail1 = d.trail1;
-        k      = next_point(d.place.lower + d.place.width);
+        k      = next_point(d.place.begin + d.place.width);
         Mask same =
             d.place.node == last_leaf; // two points on the same border, by rounding
         last_leaf = d.place.node;
-        return { d.place.node & ~kLeafBit, dr::minimum(1.f, expected * d.place.width),
-                 !same };
+        return { d.place.node & ~kLeafBit, dr::minimum(1.f, d.place.width), !same };
     }
 
 private:
     static Place root(const Float &width) { return { UInt32(0), Float(0.f), width }; }
-    static Float inside(const Float &x) { return dr::clip(x, 0.f, kBelowOne); }
 
-    /// Does point k lie in the interval of a place?
+    /// Does point k, which is not in front of a place, lie in its interval?
     Mask holds(const Place &place, const Float &k) const {
-        Float x = k + offset;
-        return x >= expected * place.lower && x < expected * (place.lower + place.width);
+        return k + offset < place.begin + place.width;
     }
 
     /// First point at or beyond `end`, and at least one further than the current one
     Float next_point(const Float &end) const {
-        return dr::maximum(k + 1.f, dr::ceil(dr::fmsub(expected, end, offset)));
+        return dr::maximum(k + 1.f, dr::ceil(end - offset));
     }
 
     template <typename Descent>
     void descend(const TreeView<Float> &tree, const Receiver<Float> &at,
                  Descent &s) const {
         WideNodeView<Float> node(tree, s.place.node, true);
-        ChildChoice<Float> choice =
-            choose_child(child_probabilities(tree, at, node.clusters), node.child, s.x);
-        Place child{ choice.child, dr::fmadd(choice.lower, s.place.width, s.place.lower),
-                     choice.probability * s.place.width };
+        ChildWeights<Float> weights = child_weights(tree, at, node.clusters);
+        Float x                     = s.x * weights.total();
+        ChildChoice<Float> choice   = choose_child(weights, node.child, x);
+        Float scale                 = s.place.width / weights.total();
+        Place child{ choice.child, dr::fmadd(choice.begin, scale, s.place.begin),
+                     choice.weight * scale };
 
         // Remember this node if it holds a point beyond the child (the root needs no place)
         Mask push =
-            s.place.node != 0u && holds(s.place, next_point(child.lower + child.width));
+            s.place.node != 0u && holds(s.place, next_point(child.begin + child.width));
         s.trail1 = dr::select(push, s.trail0, s.trail1);
         s.trail0 = dr::select(push, s.place, s.trail0);
 
-        s.x = inside((s.x - choice.lower) / choice.probability);
+        s.x = (x - choice.begin) / choice.weight;
         /* A descent magnifies the rounding of x. Where the interval becomes too small for a
            second point, x is uniform in it, so low-order digits may be added. */
-        Mask single = expected * s.place.width >= 1.f && expected * child.width <= 1.f;
-        Float x     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
-        s.x = dr::select(single, inside(x - dr::select(x >= 1.f, Float(1.f), 0.f)), s.x);
-        s.place = child;
+        Mask single = s.place.width >= 1.f && child.width <= 1.f;
+        Float y     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
+        s.x         = dr::minimum(dr::select(single, y - dr::floor(y), s.x), kBelowOne);
+        s.place     = child;
         s.visits += 1u;
     }
 };
@@ -347,7 +346,9 @@ private:
             for (int i = 0; i < 3; ++i)
                 clusters.axis[i].entry(slot) = unpack_axis<Float>(axis, i);
         }
-        return child_probabilities(tree, at, clusters).entry(0);
+        clusters.flux /= clusters.flux.entry(0) + clusters.flux.entry(1);
+        ChildWeights<Float> weights = child_weights(tree, at, clusters);
+        return weights.weight.entry(0) / weights.total();
     }
 };
 

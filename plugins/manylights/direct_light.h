@@ -121,7 +121,7 @@ public:
             Mask active_b =
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
             SurfaceInteraction3f hit =
-                m_scene->ray_intersect(si.spawn_ray(si.to_world(bs.wo)), active_b);
+                m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), active_b);
             auto [radiance, light] = m_emission.emitted(hit, active_b);
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
@@ -152,11 +152,12 @@ public:
             dr::suspend_grad<Float> detached;
             const auto &tree = m_lights.tree();
             Row<FloatD> row  = tree.row(light, plain(found));
-            FloatD pdf       = by_kind<FloatD>(row, table_kinds(), [&](LightKind kind) {
-                return light_pdf<FloatD>(row, kind, p, plain(hit.p),
-                                         plain(Vector3f(hit.n)));
-            });
-            result           = Float(pdf);
+            FloatD pdf =
+                by_kind<FloatD>(row, m_lights.table_kinds(), [&](LightKind kind) {
+                    return light_pdf<FloatD>(row, kind, p, plain(hit.p),
+                                             plain(Vector3f(hit.n)));
+                });
+            result = Float(pdf);
             if (tree.kinds.has(LightKind::Other)) {
                 Mask other = found && row.is(LightKind::Other);
                 if (dr::any_or<true>(other)) {
@@ -616,9 +617,10 @@ private:
                       const FloatD &inclusion, bool target_only, Mask active) const {
         using LightPointD = LightPoint<FloatD>;
         mitsuba::Point<FloatD, 2> ud(plain(u.x()), plain(u.y()));
-        LightPointD point = by_kind<LightPointD>(row, table_kinds(), [&](LightKind kind) {
-            return sample_light<FloatD>(row, kind, vertex.at.p, ud);
-        });
+        LightPointD point =
+            by_kind<LightPointD>(row, m_lights.table_kinds(), [&](LightKind kind) {
+                return sample_light<FloatD>(row, kind, vertex.at.p, ud);
+            });
         active &= point.pdf > 0.f;
 
         Interaction3f from = vertex.origin();
@@ -640,10 +642,6 @@ private:
         Mask delta      = row.kind() <= (uint32_t) LightKind::Spot;
         Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
         return { f * emission * Float(point.weight) & active, Point3f(point.p), from.p };
-    }
-
-    KindSet table_kinds() const {
-        return { m_lights.tree().kinds.bits & ~(1u << (uint32_t) LightKind::Other) };
     }
 
     /// What the vertex scatters times the MIS weight of the light side

@@ -178,6 +178,27 @@ LightPoint<Float> sample_light(const Row<Float> &row, LightKind kind,
     return result;
 }
 
+/// Unit normal of a light at its point `p`, on the side that emits (any kind but `Other`)
+template <typename Float>
+mitsuba::Vector<Float, 3> light_normal(const Row<Float> &row, LightKind kind,
+                                       const mitsuba::Point<Float, 3> &p) {
+    using Vector3f = mitsuba::Vector<Float, 3>;
+    switch (kind) {
+        case LightKind::Triangle:
+        case LightKind::Disk:
+            return dr::normalize(dr::cross(row.vector(3), row.vector(6)));
+        case LightKind::Sphere:
+            return dr::normalize(Vector3f(p - row.vector(0))) * row[4];
+        case LightKind::Cylinder: {
+            Vector3f axis = row.vector(3), w(p - row.vector(0));
+            return dr::normalize(w - axis * (dr::dot(w, axis) / dr::squared_norm(axis))) *
+                   row[7];
+        }
+        default:
+            return Vector3f(0.f);
+    }
+}
+
 /// Density with which \ref sample_light would choose the point `p` of geometric normal `n`
 template <typename Float>
 Float light_pdf(const Row<Float> &row, LightKind kind, const mitsuba::Point<Float, 3> &x,

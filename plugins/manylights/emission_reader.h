@@ -86,8 +86,7 @@ template <typename Float, typename Spectrum> struct EmissionReader {
         if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
             return color[0];
         else
-            return mitsuba::luminance(
-                mitsuba::Color<float, 3>(color[0], color[1], color[2]));
+            return dr::norm(mitsuba::Color<float, 3>(color[0], color[1], color[2]));
     }
 
 private:

@@ -74,11 +74,12 @@ template <typename Float, typename Value>
 Value lobe(const Receiver<Float> &at, const Value &cos_o, const Value &dot_wi,
            const Value &spread2) {
     Float cos_i = dr::dot(at.n, at.wi);
-    Value cos_h2 =
-        dr::minimum(dr::square(cos_o + cos_i) * dr::rcp(2.001f + 2.f * dot_wi), 1.f);
-    Value a = dr::minimum(.5f * spread2 + at.alpha2, 1.f);
-    Value d = dr::fmadd(cos_h2, a - 1.f, 1.f);
-    return a * at.specular * dr::rcp(d * d) + at.diffuse;
+    // Both terms over |wi + w / e|^2: one division
+    Value length2 = dr::fmadd(dot_wi, 2.f, 2.001f),
+          cos2    = dr::minimum(dr::square(cos_o + cos_i), length2);
+    Value a       = dr::minimum(dr::fmadd(spread2, .5f, at.alpha2), 1.f);
+    Value d       = length2 / dr::fmadd(cos2, a - 1.f, length2);
+    return dr::fmadd(a * at.specular, d * d, at.diffuse);
 }
 
 /// The part of a wide node that the importance needs, for its four children
@@ -113,8 +114,6 @@ template <typename Value, typename Float> struct SegmentView {
 
 /// Smallest factor by which the direction of emission may lower h
 constexpr float kEmissionFloor = .05f;
-/// Rounds the corner of the smooth cosine, as a fraction of distance^2
-constexpr float kCosineRounding = 1e-6f;
 
 /// What the lights' directions of emission allow, the same for the whole tree
 enum class Directions {
@@ -186,11 +185,11 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
  *
  *     w = mean - x,  e^2 = |w|^2 + variance
  *     h = flux / e^2 * c / e * max(1 + 2 o + 5/8 (3 o^2 - |a|^2), floor)
- *     c = (n.w + sqrt((n.w)^2 + variance + 1e-6 e^2)) / 2      smooth max(n.w, 0)
- *     o = -a.w / e                                              a: mean emission axis
+ *     c = n.w + sqrt((n.w)^2 + variance)      2 max(n.w, 0), smoothed
+ *     o = -a.w / e                            a: mean emission axis
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
- * above it, and nothing ever becomes zero. The second factor is that of \ref emission.
+ * above it. Siblings are compared, so that constant factors do not matter. The second factor is that of \ref emission.
  * In scenes with glossy surfaces h is multiplied with the receiver's \ref lobe. In a medium
  * there is no cosine, and h has the \ref attenuation. For segments see
  * \ref segment_importance.
@@ -207,10 +206,7 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
 
     F4 t = dr::fmadd(wx, F4(at.n.x()), dr::fmadd(wy, F4(at.n.y()), wz * at.n.z()));
     t    = dr::select(at.transmits, dr::abs(t), t);
-    F4 cosine =
-        .5f * (t + dr::sqrt(dr::fmadd(t, t, dr::fmadd(kCosineRounding, e2, c.variance))));
-
-    F4 projected = cosine * ie;
+    F4 projected = (t + dr::sqrt(dr::fmadd(t, t, c.variance))) * ie;
     if (at.media)
         projected =
             dr::select(at.in_medium, F4(1.f), projected) * attenuation(at, F4(e2 * ie));

@@ -2,7 +2,7 @@
 
 /**
  * The tree as the kernels see it, and the one function that both sampling and its
- * density use: the probabilities of a node's four children.
+ * density use: the weights of a node's four children.
  *
  * Conty Estevez, Hellmuth and Lecocq, "A Resampled Tree for Many Lights Rendering",
  * SIGGRAPH Talks 2024, section 2. Candidates are drawn in candidates.h.
@@ -26,9 +26,13 @@ template <typename Float> struct TreeView {
     using FBuffer  = dr::DynamicArray<Float>;
     using Storage  = std::conditional_t<dr::is_jit_v<Float>, Float, FBuffer>;
     using Receiver = manylights::Receiver<Float>;
+    using IndexStorage =
+        std::conditional_t<dr::is_jit_v<Float>, UInt32, dr::DynamicArray<UInt32>>;
 
     /// Wide nodes, binary nodes (method `talk` only) and rows of the table
     Storage nodes, binary, rows;
+    /// 4 * parent + slot of the wide nodes
+    IndexStorage node_links;
     uint32_t light_count = 0;
     KindSet kinds;
     Directions directions = Directions::All;
@@ -41,6 +45,13 @@ template <typename Float> struct TreeView {
             return dr::gather<dr::Array<Float, Count>>(buffer, index, active);
         else
             return dr::load<dr::Array<Float, Count>>(buffer.data() + index * Count);
+    }
+
+    UInt32 parent_link(const UInt32 &node) const {
+        if constexpr (dr::is_jit_v<Float>)
+            return dr::gather<UInt32>(node_links, node);
+        else
+            return node_links.data()[node];
     }
 
     Row<Float> row(const UInt32 &light, const Mask &active = true) const {
@@ -63,16 +74,16 @@ template <typename Float> struct WideNodeView {
 
     Clusters<Float> clusters;
     dr::Array<UInt32, 4> child;
-    UInt32 link;
 
     WideNodeView(const TreeView<Float> &tree, const UInt32 &node,
                  const dr::mask_t<Float> &active) {
         if constexpr (dr::is_jit_v<Float>) {
-            auto lower = tree.template fetch<16>(tree.nodes, 2u * node, active),
-                 upper = tree.template fetch<16>(tree.nodes, 2u * node + 1u, active);
-            unpack(tree, [&](size_t i) {
-                return i < 16 ? lower.entry(i) : upper.entry(i - 16);
-            });
+            // What a scene does not need is not read
+            auto part = [&](uint32_t i) {
+                return tree.template fetch<8>(tree.nodes, 3u * node + i, active);
+            };
+            dr::Array<Float, 8> data[3] = { part(0), part(1), part(2) };
+            unpack(tree, [&](size_t i) { return data[i / 8].entry(i % 8); });
         } else {
             const float *data = tree.nodes.data() + kWideNodeFloats * node;
             unpack(tree, [data](size_t i) { return data[i]; });
@@ -87,62 +98,74 @@ private:
         using U4 = dr::uint32_array_t<Four<Float>>;
         for (int i = 0; i < 3; ++i)
             clusters.mean[i] = four(4 * i);
-        clusters.variance = four(12);
-        clusters.flux     = four(16);
+        U4 moments        = dr::reinterpret_array<U4>(four(12));
+        clusters.flux     = dr::reinterpret_array<Four<Float>>(moments & 0xffff0000u);
+        clusters.variance = dr::reinterpret_array<Four<Float>>(dr::sl<16>(moments));
+        for (size_t i = 0; i < 4; ++i)
+            child.entry(i) = dr::reinterpret_array<UInt32>(read(16 + i));
         if (tree.directions != Directions::All) {
             U4 axis = dr::reinterpret_array<U4>(four(20));
             for (int i = 0; i < 3; ++i)
                 clusters.axis[i] = unpack_axis<Four<Float>>(axis, i);
         }
-        for (size_t i = 0; i < 4; ++i)
-            child.entry(i) = dr::reinterpret_array<UInt32>(read(24 + i));
-        link = dr::reinterpret_array<UInt32>(read(28));
     }
 };
 
+/// Weights of the four children of a node, to which their probabilities are proportional
+template <typename Float> struct ChildWeights {
+    dr::Array<Float, 4> weight;
+    /// [0, end[0]) belongs to the first child, [end[0], end[1]) to the second, ...
+    dr::Array<Float, 4> end;
+
+    Float total() const { return end.entry(3); }
+};
+
 /**
- * Probabilities of the four children, proportional to h with a defensive share of the
- * flux. They are positive for every child and sum to 1; an empty slot has 0.
+ * Weight h with a defensive share of the flux. They are positive for every child, and 0 for
+ * an empty slot.
  */
 template <typename Float>
-dr::Array<Float, 4> child_probabilities(const TreeView<Float> &tree,
-                                        const Receiver<Float> &at,
-                                        const Clusters<Float> &clusters) {
-    Four<Float> h  = cluster_importance(at, clusters, tree.directions);
-    Float sum_h    = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
-    Float sum_flux = (clusters.flux.entry(0) + clusters.flux.entry(1)) +
-                     (clusters.flux.entry(2) + clusters.flux.entry(3));
+ChildWeights<Float> child_weights(const TreeView<Float> &tree, const Receiver<Float> &at,
+                                  const Clusters<Float> &clusters) {
+    Four<Float> h = cluster_importance(at, clusters, tree.directions);
+    Float sum     = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     /* On top of a light h overflows, very far away it vanishes: then the flux alone decides.
        (A least variance for all clusters, 1e-6 of the scene's extent squared, would do the
        same, but blurs lights: .055 in place of .012 of relative variance where some of them
        are 1e6 times as far away as others, 1.5 in place of .025 at 1e-6 units from one.) */
-    auto usable   = sum_h > 1e-30f && sum_h < 1e30f;
-    Float share   = dr::select(usable, Float(kDefensiveShare), 1.f);
-    Float scale_h = dr::select(usable, (1.f - kDefensiveShare) / sum_h, 0.f);
-    Four<Float> q = dr::fmadd(dr::select(usable, h, 0.f), Four<Float>(scale_h),
-                              clusters.flux * (share / sum_flux));
-    return { q.entry(0), q.entry(1), q.entry(2), q.entry(3) };
+    auto usable = sum > 1e-30f && sum < 1e30f;
+    Float share =
+        dr::select(usable, sum * (kDefensiveShare / (1.f - kDefensiveShare)), Float(1.f));
+    Four<Float> weight =
+        dr::fmadd(clusters.flux, Four<Float>(share), dr::select(usable, h, 0.f));
+    ChildWeights<Float> result;
+    Float end(0.f);
+    for (size_t i = 0; i < 4; ++i) {
+        result.weight.entry(i) = weight.entry(i);
+        end += weight.entry(i);
+        result.end.entry(i) = end;
+    }
+    return result;
 }
 
-/// Which child a number in [0, 1) falls on, and the child's interval
+/// The child on which a number falls
 template <typename Float> struct ChildChoice {
     dr::uint32_array_t<Float> child;
-    Float lower, probability;
+    Float begin, weight;
 };
 
-/// The last child whose interval starts at or below `x` (empty slots are never it)
+/// The last child that starts at or below `x` < total: never an empty slot, where both its
+/// ends are the total or those of the child before it
 template <typename Float>
-ChildChoice<Float> choose_child(const dr::Array<Float, 4> &q,
+ChildChoice<Float> choose_child(const ChildWeights<Float> &weights,
                                 const dr::Array<dr::uint32_array_t<Float>, 4> &child,
                                 const Float &x) {
-    ChildChoice<Float> choice{ child.entry(0), Float(0.f), q.entry(0) };
-    Float lower = q.entry(0);
+    ChildChoice<Float> choice{ child.entry(0), Float(0.f), weights.weight.entry(0) };
     for (size_t i = 1; i < 4; ++i) {
-        auto take          = x >= lower && q.entry(i) > 0.f;
-        choice.child       = dr::select(take, child.entry(i), choice.child);
-        choice.lower       = dr::select(take, lower, choice.lower);
-        choice.probability = dr::select(take, q.entry(i), choice.probability);
-        lower += q.entry(i);
+        auto take     = x >= weights.end.entry(i - 1);
+        choice.child  = dr::select(take, child.entry(i), choice.child);
+        choice.begin  = dr::select(take, weights.end.entry(i - 1), choice.begin);
+        choice.weight = dr::select(take, weights.weight.entry(i), choice.weight);
     }
     return choice;
 }
@@ -165,14 +188,14 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
     loop(
         state, [](const State &s) { return s.link != kNone; },
         [&](State &s) {
-            WideNodeView<Float> node(tree, s.link >> 2u, true);
-            auto q      = child_probabilities(tree, at, node.clusters);
-            UInt32 slot = s.link & 3u;
-            Float p     = q.entry(0);
+            UInt32 index = s.link >> 2u, slot = s.link & 3u;
+            WideNodeView<Float> node(tree, index, true);
+            auto weights = child_weights(tree, at, node.clusters);
+            Float w      = weights.weight.entry(0);
             for (uint32_t i = 1; i < 4; ++i)
-                p = dr::select(slot == i, q.entry(i), p);
-            s.probability *= p;
-            s.link = node.link;
+                w = dr::select(slot == i, weights.weight.entry(i), w);
+            s.probability *= w / weights.total();
+            s.link = tree.parent_link(index);
         },
         "Light tree: probability of a leaf");
     return state.probability;

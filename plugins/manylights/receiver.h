@@ -23,7 +23,7 @@ public:
         UnpolarizedSpectrum v = mitsuba::unpolarized_spectrum(value);
         Float result;
         if constexpr (mitsuba::is_rgb_v<Spectrum>)
-            result = mitsuba::luminance(v);
+            result = dr::norm(v);
         else
             result = dr::mean(v);
         FloatD g = plain(result);

@@ -21,6 +21,37 @@ public:
         : m_scene(scene), m_lights(lights) {}
 
     /**
+     * What a ray finds, as far as the following functions need it. Where the table knows all
+     * emission, no shape is called: normals come from the rows, and there are none on
+     * surfaces that do not emit.
+     */
+    SurfaceInteraction3f find_light(const Ray3f &ray, Mask active) const {
+        if (m_lights.needs_emitter_eval())
+            return m_scene->ray_intersect(ray, active);
+        auto pi = m_scene->ray_intersect_preliminary(ray, /* coherent = */ false, active);
+        Mask valid              = active && pi.is_valid();
+        SurfaceInteraction3f si = dr::zeros<SurfaceInteraction3f>();
+        si.t                    = dr::select(valid, pi.t, dr::Infinity<Float>);
+        si.p                    = dr::select(valid, ray(pi.t), ray.o);
+        si.time                 = ray.time;
+        si.wavelengths          = ray.wavelengths;
+        si.shape                = dr::select(valid, pi.shape, nullptr);
+        si.prim_index           = pi.prim_index;
+        si.wi                   = -ray.d;
+        if (!m_lights.can_be_hit())
+            return si;
+        UInt32D light   = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
+        MaskD found     = light < kOnlyHit;
+        Row<FloatD> row = m_lights.tree().row(light, found);
+        using VectorD   = mitsuba::Vector<FloatD, 3>;
+        si.n  = by_kind<VectorD>(row, m_lights.table_kinds(), [&](LightKind kind) {
+            return light_normal<FloatD>(row, kind, plain(si.p));
+        });
+        si.wi = dr::select(valid, Vector3f(0.f, 0.f, dr::dot(si.n, si.wi)), si.wi);
+        return si;
+    }
+
+    /**
      * Radiance emitted from a surface (or the environment, without a hit) against the ray
      * that found it, and the surface's light in the table.
      */

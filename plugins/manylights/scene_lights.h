@@ -157,22 +157,24 @@ public:
         m_tree.light_count = (uint32_t) rows.size();
         m_tree.nodes =
             upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
-        m_tree.binary = upload((const float *) tree.binary.data(),
-                               tree.binary.size() * kBinaryNodeFloats);
-        m_tree.rows   = upload((const float *) rows.data(), rows.size() * kRowFloats);
+        m_tree.node_links = upload_indices(tree.node_link);
+        m_tree.binary     = upload((const float *) tree.binary.data(),
+                                   tree.binary.size() * kBinaryNodeFloats);
+        m_tree.rows       = upload((const float *) rows.data(), rows.size() * kRowFloats);
         upload_map(table, tree);
         if constexpr (dr::is_jit_v<Float>)
-            dr::eval(m_tree.nodes, m_tree.binary, m_tree.rows, m_shape_lights,
-                     m_light_of_primitive);
+            dr::eval(m_tree.nodes, m_tree.node_links, m_tree.binary, m_tree.rows,
+                     m_shape_lights, m_light_of_primitive);
 
         m_statistics.lights         = table.light_count;
         m_statistics.lights_in_tree = m_tree.light_count;
         m_statistics.nodes          = (uint32_t) tree.wide.size();
         m_statistics.depth          = tree.depth;
         m_statistics.bytes =
-            sizeof(float) * ((double) dr::width(m_tree.nodes) + dr::width(m_tree.binary) +
-                             dr::width(m_tree.rows) + dr::width(m_light_of_primitive) +
-                             dr::width(m_shape_lights));
+            sizeof(float) *
+            ((double) dr::width(m_tree.nodes) + dr::width(m_tree.node_links) +
+             dr::width(m_tree.binary) + dr::width(m_tree.rows) +
+             dr::width(m_light_of_primitive) + dr::width(m_shape_lights));
         m_statistics.build_ms = std::chrono::duration<float, std::milli>(
                                     std::chrono::steady_clock::now() - start)
                                     .count();
@@ -198,6 +200,10 @@ public:
     const Tree &tree() const { return m_tree; }
     /// Has any surface a glossy lobe?
     bool glossy() const { return m_glossy; }
+    /// Kinds of light that are sampled from the table
+    KindSet table_kinds() const {
+        return { m_tree.kinds.bits & ~(1u << (uint32_t) LightKind::Other) };
+    }
     /// Media of the shapes and sensors
     const MediaKinds &media() const { return m_media; }
     const std::vector<const Emitter *> &infinite() const { return m_infinite; }
@@ -235,10 +241,9 @@ public:
     MI_DECLARE_CLASS(SceneLights)
 
 private:
-    using Table   = HostTable<Float, Spectrum>;
-    using Storage = typename Tree::Storage;
-    using IndexStorage =
-        std::conditional_t<dr::is_jit_v<Float>, UInt32D, dr::DynamicArray<UInt32D>>;
+    using Table        = HostTable<Float, Spectrum>;
+    using Storage      = typename Tree::Storage;
+    using IndexStorage = typename Tree::IndexStorage;
 
     static Directions directions(const Table &table) {
         if (table.beams)
@@ -269,6 +274,11 @@ private:
     static Storage upload(const float *data, size_t size) {
         // Never empty: kernels may refer to it with all lanes inactive
         return size ? dr::load<Storage>(data, size) : dr::zeros<Storage>(kWideNodeFloats);
+    }
+
+    static IndexStorage upload_indices(const std::vector<uint32_t> &data) {
+        return data.empty() ? dr::zeros<IndexStorage>(1)
+                            : dr::load<IndexStorage>(data.data(), data.size());
     }
 
     void upload_map(const Table &table, const LightTree &tree) {

@@ -343,12 +343,15 @@ private:
 
         uint32_t index = (uint32_t) tree.wide.size();
         tree.wide.emplace_back();
-        WideNode node{};
-        node.link  = link;
+        tree.node_link.push_back(link);
+        WideNode node;
+        double flux = 0;
+        for (uint32_t slot = 0; slot < count; ++slot)
+            flux += cluster(children[slot]).flux;
         tree.depth = std::max(tree.depth, depth);
         for (uint32_t slot = 0; slot < count; ++slot) {
             const Subtree &child = children[slot];
-            write_child(node, slot, cluster(child));
+            write_child(node, slot, cluster(child), flux);
             if (child.is_leaf()) {
                 node.child[slot]       = kLeafBit | child.begin;
                 tree.link[child.begin] = 4 * index + slot;
@@ -356,6 +359,8 @@ private:
                 node.child[slot] = collapse(tree, child, 4 * index + slot, depth + 1);
             }
         }
+        for (uint32_t slot = count; slot < 4; ++slot)
+            write_empty(node, slot);
         tree.wide[index] = node;
         return index;
     }
@@ -389,12 +394,22 @@ private:
         return x.cost != y.cost ? x.cost > y.cost : x.flux > y.flux;
     }
 
-    static void write_child(WideNode &node, uint32_t slot, const Cluster &cluster) {
+    static void write_child(WideNode &node, uint32_t slot, const Cluster &cluster,
+                            double node_flux) {
         for (int i = 0; i < 3; ++i)
             node.mean[i][slot] = cluster.mean[i];
-        node.variance[slot] = cluster.variance;
-        node.flux[slot]     = cluster.flux;
-        node.axis[slot]     = pack_axis(cluster.axis);
+        node.moments[slot] =
+            pack_moments((float) (cluster.flux / node_flux), cluster.variance);
+        node.axis[slot] = pack_axis(cluster.axis);
+    }
+
+    /// As far away as another child, and without flux
+    static void write_empty(WideNode &node, uint32_t slot) {
+        for (int i = 0; i < 3; ++i)
+            node.mean[i][slot] = node.mean[i][0];
+        node.moments[slot] = node.moments[0] & 0xffffu;
+        node.child[slot]   = node.child[0];
+        node.axis[slot]    = node.axis[0];
     }
 
     /// Append the nodes of a subtree, leaves included
@@ -436,6 +451,14 @@ private:
 
 LightTree build_tree(const std::vector<LightBounds> &lights, bool keep_binary) {
     return Builder(lights).build(keep_binary);
+}
+
+uint32_t pack_moments(float flux, float variance) {
+    auto upper = [](float x) { // no overflow: up to the largest such number
+        uint32_t bits = dr::reinterpret_array<uint32_t>(std::min(x, 0x1.fep127f));
+        return (bits + 0x8000u) >> 16;
+    };
+    return upper(flux > 0 ? std::max(flux, FLT_MIN) : 0.f) << 16 | upper(variance);
 }
 
 uint32_t pack_axis(const float axis[3]) {
