@@ -169,7 +169,8 @@ public:
             pi.compute_surface_interaction(ray, +RayFlags::All, active);
         Spectrum result(0.f);
         if (!m_hide_emitters)
-            result = direct.emission().emitted(si, active).first;
+            result = direct.emission().emitted(si, direct.emission().light_at(si, active),
+                                               active);
 
         active &= si.is_valid();
         Mask valid_ray = active;

@@ -120,9 +120,9 @@ public:
             value            = si.to_world_mueller(value, -bs.wo, si.wi);
             Mask active_b =
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
-            SurfaceInteraction3f hit =
+            auto [hit, light] =
                 m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), active_b);
-            auto [radiance, light] = m_emission.emitted(hit, active_b);
+            Spectrum radiance = m_emission.emitted(hit, light, active_b);
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
             Float light_pdf = dr::select(delta, 0.f,

@@ -86,15 +86,15 @@ LightPoint<Float> sample_sphere(const Row<Float> &row, const mitsuba::Point<Floa
         sin2 * inv_sin_max + cos_theta * dr::safe_sqrt(1.f - sin2 / cone.sin2);
     Float sin_alpha     = dr::safe_sqrt(1.f - dr::square(cos_alpha));
     auto [sin_p, cos_p] = dr::sincos(dr::TwoPi<Float> * u.y());
-    Vector3f outside =
-        Frame3f(-dr::normalize(to_center))
-            .to_world(Vector3f(cos_p * sin_alpha, sin_p * sin_alpha, cos_alpha));
-    Vector3f inside = mitsuba::warp::square_to_uniform_sphere(u);
+    Vector3f d = Frame3f(-dr::normalize(to_center))
+                     .to_world(Vector3f(cos_p * sin_alpha, sin_p * sin_alpha, cos_alpha));
+    if (dr::any_or<true>(!cone.outside))
+        dr::masked(d, !cone.outside) = mitsuba::warp::square_to_uniform_sphere(u);
 
     LightPoint<Float> result = dr::zeros<LightPoint<Float>>();
-    Vector3f d = dr::select(cone.outside, outside, inside), n = d * row[4];
-    result.p   = row.vector(0) + radius * d;
-    result.pdf = sphere_pdf<Float>(cone, radius, result.p - x, n);
+    Vector3f n               = d * row[4];
+    result.p                 = row.vector(0) + radius * d;
+    result.pdf               = sphere_pdf<Float>(cone, radius, result.p - x, n);
     return result;
 }
 

@@ -192,7 +192,9 @@ private:
                       Mask active) const {
         if (m_limits.hide_emitters) // area emitters were skipped, the environment not
             active &= s.depth > 0u || si.is_valid();
-        auto [radiance, light] = m_direct.emission().emitted(si, active);
+        const auto &emission = m_direct.emission();
+        auto light           = emission.light_at(si, active);
+        Spectrum radiance    = emission.emitted(si, light, active);
         Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
                                                light, active && !s.specular);
         Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
@@ -273,6 +275,9 @@ private:
     /// What the density of finding a light by chance needs of the vertex that a path leaves
     void remember(State &s, const Vertex &vertex, const Piece &piece,
                   const Direction &next, Mask leaves) const {
+        dr::masked(s.depth, leaves) = s.depth + 1u;
+        if (!m_sees_lights)
+            return;
         Receiver<FloatD> at = vertex.at;
         Float u_tree        = vertex.u.tree;
         if (m_segments) {
@@ -280,14 +285,13 @@ private:
             at         = dr::select(plain(along), piece.along, at);
             u_tree     = dr::select(along, piece.u_tree, u_tree);
         }
-        s.from                      = dr::select(plain(leaves), at, s.from);
-        s.from.glossy               = vertex.at.glossy;
-        s.from.media                = vertex.at.media;
-        s.from.extent               = m_segments ? Extent::Either : Extent::Point;
-        s.u_tree                    = dr::select(leaves, u_tree, s.u_tree);
-        s.pdf                       = dr::select(leaves, dr::detach(next.pdf), s.pdf);
-        s.specular                  = dr::select(leaves, next.specular, s.specular);
-        dr::masked(s.depth, leaves) = s.depth + 1u;
+        s.from        = dr::select(plain(leaves), at, s.from);
+        s.from.glossy = vertex.at.glossy;
+        s.from.media  = vertex.at.media;
+        s.from.extent = m_segments ? Extent::Either : Extent::Point;
+        s.u_tree      = dr::select(leaves, u_tree, s.u_tree);
+        s.pdf         = dr::select(leaves, dr::detach(next.pdf), s.pdf);
+        s.specular    = dr::select(leaves, next.specular, s.specular);
     }
 
     Direction sample_bsdf(const Vertex &vertex, const Float &u1, const Point2f &u2,

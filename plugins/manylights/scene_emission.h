@@ -20,14 +20,25 @@ public:
     SceneEmission(const Scene *scene, const Lights &lights)
         : m_scene(scene), m_lights(lights) {}
 
+    /// The light that a ray has hit: its index in the table, kOnlyHit, or kNone
+    UInt32D light_at(const SurfaceInteraction3f &si, Mask active) const {
+        if (!m_lights.can_be_hit())
+            return kNone;
+        return m_lights.find(si.shape, plain(si.prim_index),
+                             plain(active && si.is_valid()));
+    }
+
     /**
-     * What a ray finds, as far as the following functions need it. Where the table knows all
-     * emission, no shape is called: normals come from the rows, and there are none on
-     * surfaces that do not emit.
+     * What a ray finds, as far as the emission there and its density depend on it, and the
+     * light. Where the table knows all emission, no shape is called: normals come from the
+     * rows, and there are none on surfaces that do not emit.
      */
-    SurfaceInteraction3f find_light(const Ray3f &ray, Mask active) const {
-        if (m_lights.needs_emitter_eval())
-            return m_scene->ray_intersect(ray, active);
+    std::pair<SurfaceInteraction3f, UInt32D> find_light(const Ray3f &ray,
+                                                        Mask active) const {
+        if (m_lights.needs_emitter_eval()) {
+            SurfaceInteraction3f si = m_scene->ray_intersect(ray, active);
+            return { si, light_at(si, active) };
+        }
         auto pi = m_scene->ray_intersect_preliminary(ray, /* coherent = */ false, active);
         Mask valid              = active && pi.is_valid();
         SurfaceInteraction3f si = dr::zeros<SurfaceInteraction3f>();
@@ -38,30 +49,25 @@ public:
         si.shape                = dr::select(valid, pi.shape, nullptr);
         si.prim_index           = pi.prim_index;
         si.wi                   = -ray.d;
-        if (!m_lights.can_be_hit())
-            return si;
-        UInt32D light   = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
-        MaskD found     = light < kOnlyHit;
+        UInt32D light           = light_at(si, active);
+        MaskD found             = light < kOnlyHit;
+        if (!dr::any_or<true>(found))
+            return { si, light };
         Row<FloatD> row = m_lights.tree().row(light, found);
         using VectorD   = mitsuba::Vector<FloatD, 3>;
         si.n  = by_kind<VectorD>(row, m_lights.table_kinds(), [&](LightKind kind) {
             return light_normal<FloatD>(row, kind, plain(si.p));
         });
         si.wi = dr::select(valid, Vector3f(0.f, 0.f, dr::dot(si.n, si.wi)), si.wi);
-        return si;
+        return { si, light };
     }
 
-    /**
-     * Radiance emitted from a surface (or the environment, without a hit) against the ray
-     * that found it, and the surface's light in the table.
-     */
-    std::pair<Spectrum, UInt32D> emitted(const SurfaceInteraction3f &si,
-                                         Mask active) const {
+    /// Radiance emitted from a surface, which is `light`, or from the environment, against
+    /// the ray that found it
+    Spectrum emitted(const SurfaceInteraction3f &si, const UInt32D &light,
+                     Mask active) const {
         Spectrum result(0.f);
-        UInt32D light(kNone);
-        Mask valid = active && si.is_valid();
         if (m_lights.can_be_hit()) {
-            light         = m_lights.find(si.shape, plain(si.prim_index), plain(valid));
             Mask in_table = light < kOnlyHit, by_plugin = light == kOnlyHit;
             if (dr::any_or<true>(in_table)) {
                 Row<FloatD> row = m_lights.tree().row(light, plain(in_table));
@@ -79,7 +85,7 @@ public:
         if (const Emitter *environment = m_scene->environment())
             add_masked(result, active && !si.is_valid(),
                        [&](Mask m) { return environment->eval(si, m); });
-        return { result, light };
+        return result;
     }
 
     EmitterPtr emitter_of(const Row<FloatD> &row) const {
