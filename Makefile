@@ -70,6 +70,10 @@ bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
 	env -u HOME $(BIN)/manylights bench --quick --out bench-quick $(ARGS)
 	$(BIN)/manylights report bench-quick
 
+.PHONY: microbench
+microbench: $(INSTALLED) $(VENV)/.dev-tools  ## Time building, traversal and resampling alone (a minute) into microbench.json
+	$(BIN)/python -m pytest tests/bench_tree.py --benchmark-json=microbench.json $(ARGS)
+
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling
 	$(BIN)/ruff check python tests
@@ -84,7 +88,7 @@ format: $(VENV)/.dev-tools  ## Rewrite the sources in the style that lint checks
 
 .PHONY: clean
 clean:  ## Delete everything that was built, .venv too
-	rm -rf build dist $(VENV) .pytest_cache .ruff_cache .hypothesis demo.exr demo.png bench bench-quick
+	rm -rf build dist $(VENV) .pytest_cache .ruff_cache .hypothesis demo.exr demo.png bench bench-quick microbench.json
 	find python tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip 25.1 is the first that can install the dependency groups of pyproject.toml.

@@ -156,12 +156,10 @@ looks = st.builds(
 WIDE = np.dtype(
     [
         ("mean", "f4", (3, 4)),
-        ("variance", "f4", 4),
-        ("flux", "f4", 4),
-        ("axis", "u4", 4),
+        # Flux in the upper halves of the words, variance in the lower ones
+        ("moments", "u4", 4),
         ("child", "u4", 4),
-        ("link", "u4"),
-        ("padding", "u4", 3),
+        ("axis", "u4", 4),
     ]
 )
 BINARY = np.dtype(
