@@ -96,16 +96,22 @@ constexpr uint32_t make_tag(LightKind kind, bool tabulated, uint32_t emitter) {
  * falls, and less elsewhere. Narrow ones have lobes of their own (\ref Directions): with
  * these, 1,000 spots of 5 degrees have .075 instead of .85 of relative variance, at 1.3
  * times the time.
+ *
+ * One cache line of four SIMD registers: the builder sorts these in place.
  */
-struct LightBounds {
-    float box_min[3], box_max[3];
+struct alignas(64) LightBounds {
+    float box_min[3], flux;
+    float box_max[3];
+    /// Index of the light in the builder's input
+    uint32_t light;
     /// Mean position and its variance (trace of the covariance / 3)
     float mean[3], variance;
     /// Emission axis, 0 for what shines in all directions: a unit vector for one-sided
     /// planar emitters and spots. With narrow spots in the scene, the mean direction of
     /// emission, whose length is the mean cosine
     float axis[3];
-    float flux;
+    /// For the builder: the weight of the axis
+    float weight;
 };
 
 } // namespace manylights

@@ -14,18 +14,22 @@
  *   over the lights, so that bins are merged without trigonometry.
  *
  * Where the cost cannot decide (coincident lights) and below a depth of 64, the range
- * is halved, so the depth is bounded. The same input gives the same tree, bit for bit.
+ * is halved, so the depth is bounded. The same input gives the same tree, bit for bit,
+ * with any number of threads.
  *
  * Plain C++: compiled once for all variants.
  */
 
+#include "host_memory.h"
 #include "light.h"
+#include <functional>
 
 namespace manylights {
 
 /**
  * A node of the default tree: the moments of its four children, as a structure of
- * arrays so that one packet gather brings the same quantity of all four.
+ * arrays so that one packet gather brings the same quantity of all four. Children are
+ * stored behind their parents.
  */
 struct WideNode {
     /// Flux-weighted mean position of each child
@@ -64,23 +68,36 @@ struct BinaryNode {
 constexpr size_t kBinaryNodeFloats = 16;
 static_assert(sizeof(BinaryNode) == kBinaryNodeFloats * sizeof(float));
 
-/// The tree and the order of the lights that it implies
+/// The tree, and the order of the lights that it implies
 struct LightTree {
-    std::vector<WideNode> wide;
+    /// Nodes of the wide tree, in the caller's memory
+    uint32_t wide_count = 0;
     std::vector<BinaryNode> binary;
     /// order[i] is the input index of light i: leaves are numbered in tree order
-    std::vector<uint32_t> order;
+    HostVector<uint32_t> order;
     /// link[i] = 4 * node + slot at which light i hangs in the wide tree
-    std::vector<uint32_t> link;
+    HostVector<uint32_t> link;
     /// Levels of the wide tree, 0 without lights
     uint32_t depth = 0;
 };
 
+/// Returns memory for that many nodes
+using NodeMemory = std::function<WideNode *(size_t)>;
+
 /**
  * Build the tree over `lights`, all of which must have finite bounds and a positive,
- * finite flux. `keep_binary` also keeps the binary nodes (method `talk`).
+ * finite flux; their memory is used up. The wide nodes go to where `memory` says, which
+ * is called if there are any. `keep_binary` also keeps the binary nodes (method `talk`).
  */
-LightTree build_tree(const std::vector<LightBounds> &lights, bool keep_binary);
+LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
+                     bool keep_binary);
+
+/**
+ * New fluxes for a tree whose lights stay in place: at each leaf, `WideNode::flux` holds
+ * the light's flux, in any unit. Topology, mean positions, variances and axes of the
+ * leaves are kept; everything above them is computed from the bottom up.
+ */
+void refit_tree(WideNode *nodes, size_t count);
 
 /// Quantize a vector of length <= 1 to three signed numbers of 10 bits, in units of 1/511
 uint32_t pack_axis(const float axis[3]);
