@@ -65,17 +65,21 @@ public:
         for (size_t i = 0; i < count; ++i)
             if (!(flux(i) > 0) || !std::isfinite(flux(i)))
                 throw nb::value_error("flux must be positive and finite");
-        std::vector<LightBounds> bounds(count);
+        HostVector<LightBounds> bounds(count);
         for (size_t i = 0; i < count; ++i)
             bounds[i] = make_bounds(mean, flux(i), axis, variance(i), i);
-        m_tree = build_tree(bounds, /* keep_binary = */ true);
+        auto memory = [this](size_t nodes) {
+            m_wide.resize(nodes);
+            return m_wide.data();
+        };
+        m_tree = build_tree(std::move(bounds), memory, /* keep_binary = */ true);
         std::vector<LightRow> rows(count);
         m_light_of.resize(count);
         for (uint32_t i = 0; i < count; ++i) {
             rows[i].link                = m_tree.link[i];
             m_light_of[m_tree.order[i]] = i;
         }
-        m_view.nodes = load(m_tree.wide.data(), m_tree.wide.size() * kWideNodeFloats);
+        m_view.nodes = load(m_wide.data(), m_wide.size() * kWideNodeFloats);
         m_view.binary =
             load(m_tree.binary.data(), m_tree.binary.size() * kBinaryNodeFloats);
         m_view.rows        = load(rows.data(), count * kRowFloats);
@@ -121,10 +125,12 @@ public:
     }
 
     uint32_t depth() const { return m_tree.depth; }
-    size_t node_count() const { return m_tree.wide.size(); }
-    const std::vector<uint32_t> &order() const { return m_tree.order; }
+    size_t node_count() const { return m_wide.size(); }
+    std::vector<uint32_t> order() const {
+        return { m_tree.order.begin(), m_tree.order.end() };
+    }
     nb::bytes nodes() const {
-        return nb::bytes(m_tree.wide.data(), m_tree.wide.size() * sizeof(WideNode));
+        return nb::bytes(m_wide.data(), m_wide.size() * sizeof(WideNode));
     }
     nb::bytes binary_nodes() const {
         return nb::bytes(m_tree.binary.data(), m_tree.binary.size() * sizeof(BinaryNode));
@@ -172,6 +178,7 @@ private:
     }
 
     LightTree m_tree;
+    std::vector<WideNode> m_wide;
     TreeView<float> m_view;
     std::vector<uint32_t> m_light_of;
 };

@@ -17,7 +17,13 @@ namespace dr = drjit;
 
 /// The value of a variable with one entry
 template <typename Float> float read_scalar(const Float &value) {
-    return (float) dr::slice(value, 0);
+    if constexpr (dr::is_jit_v<Float>) { // dr::slice makes variables on the way
+        dr::scalar_t<Float> number;
+        jit_var_read(value.index(), 0, &number);
+        return (float) number;
+    } else {
+        return (float) value;
+    }
 }
 
 template <typename T> void copy3(const T &value, float out[3]) {
@@ -25,13 +31,34 @@ template <typename T> void copy3(const T &value, float out[3]) {
         out[i] = read_scalar(value.entry(i));
 }
 
-/// A copy of a buffer on the host
-template <typename T, typename Buffer> std::vector<T> download(const Buffer &buffer) {
-    auto host = dr::migrate(buffer, JitBackend::None);
-    if constexpr (dr::is_jit_v<Buffer>)
-        dr::sync_thread();
-    return std::vector<T>(host.data(), host.data() + dr::width(buffer));
-}
+/// A buffer as it lies in memory; a copy only if that is a GPU's
+template <typename Buffer> class HostView {
+public:
+    using T = dr::scalar_t<Buffer>;
+
+    explicit HostView(const Buffer &buffer) : m_size(dr::width(buffer)) {
+        if (m_size == 0)
+            return;
+        if constexpr (dr::is_jit_v<Buffer>) {
+            m_kept = dr::detach<false>(buffer);
+            if constexpr (dr::is_cuda_v<Buffer>)
+                m_kept = dr::migrate(m_kept, JitBackend::None);
+            m_data = m_kept.data();
+            dr::sync_thread();
+        } else {
+            m_data = buffer.data();
+        }
+    }
+    const T *data() const { return m_data; }
+    size_t size() const { return m_size; }
+    const T &operator[](size_t i) const { return m_data[i]; }
+
+private:
+    struct Nothing {};
+    std::conditional_t<dr::is_jit_v<Buffer>, dr::detached_t<Buffer>, Nothing> m_kept;
+    const T *m_data = nullptr;
+    size_t m_size;
+};
 
 /// Emission that does not vary over the emitter
 struct Emission {
@@ -41,7 +68,19 @@ struct Emission {
     bool tabulated = false;
 };
 
+/// Names of the textures that make emitters shine
+constexpr std::string_view kEmissionNames[] = { "intensity", "radiance", "irradiance" };
+
 template <typename Float, typename Spectrum> struct EmissionReader {
+    /// Radiance, intensity or irradiance of an emitter; not tabulated if it has none of these
+    static Emission read(const mitsuba::Object *emitter) {
+        ParameterReader params(emitter);
+        for (std::string_view name : kEmissionNames)
+            if (params.object(name))
+                return read(params, std::string(name));
+        return {};
+    }
+
     /// Emission from the texture `name`; not tabulated if it varies or has another spectrum
     static Emission read(const ParameterReader &params, const std::string &name) {
         Emission e;

@@ -30,24 +30,21 @@ template <typename T> using HostVector = std::vector<T, UninitializedAllocator<T
 /// of threads
 constexpr size_t kChunk = 1 << 14;
 
-/// Chunks of an array, for one number or more each
-inline size_t chunk_count(size_t size) { return (size + kChunk - 1) / kChunk; }
+inline size_t chunk_count(size_t size, size_t chunk = kChunk) {
+    return (size + chunk - 1) / chunk;
+}
 
-/// Call f(chunk, begin, end) for all chunks of an array, at the same time
-template <typename F> void for_chunks(size_t size, const F &f) {
-    auto run = [&](size_t chunk) {
-        f(chunk, chunk * kChunk, std::min(size, (chunk + 1) * kChunk));
-    };
-    if (size <= kChunk) {
-        if (size > 0)
-            run(0);
-        return;
-    }
-    drjit::parallel_for(drjit::blocked_range<size_t>(0, chunk_count(size)),
-                        [&](const drjit::blocked_range<size_t> &range) {
-                            for (size_t chunk : range)
-                                run(chunk);
-                        });
+/// Call f(index of the chunk, begin, end) for all chunks of an array, at the same time
+template <typename F>
+void for_chunks(size_t size, const F &f, size_t chunk = kChunk) {
+    auto run = [&](size_t i) { f(i, i * chunk, std::min(size, (i + 1) * chunk)); };
+    size_t count = chunk_count(size, chunk);
+    if (count == 1)
+        return run(0);
+    drjit::parallel_for(drjit::blocked_range<size_t>(0, count), [&](const auto &range) {
+        for (size_t i : range)
+            run(i);
+    });
 }
 
 } // namespace manylights

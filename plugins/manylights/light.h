@@ -51,16 +51,16 @@ constexpr uint32_t kOnlyHit = 0xfffffffeu;
  * (kTagTwoSided), since the side on which it emits changes from point to point.
  */
 struct LightRow {
-    float geometry[9] = {};
-    float color[3]    = {};
+    float geometry[9];
+    float color[3];
     /// Luminance of the mean radiance or intensity; for `Other`: flux / (4 pi)
-    float luminance = 0.f;
+    float luminance;
     /// See above; 1 in RGB and monochrome variants
-    float scale = 1.f;
+    float scale;
     /// kind, flag and emitter index: see \ref make_tag
-    uint32_t tag = 0;
+    uint32_t tag;
     /// 4 * parent node + slot of this light in the parent (tree_builder.h)
-    uint32_t link = kNone;
+    uint32_t link;
 };
 
 constexpr size_t kRowFloats = 16;
@@ -79,6 +79,9 @@ constexpr uint32_t kTagKindMask     = 7;
 constexpr uint32_t kTagTabulated    = 8;
 constexpr uint32_t kTagTwoSided     = 16;
 constexpr uint32_t kTagEmitterShift = 5;
+
+/// Spot of a hard edge: 1 / (cutoff - beam width), which would be infinite
+constexpr float kHardEdge = 1e10f;
 
 /// Pack kind, "radiance is in the table" and the index into the scene's emitters
 constexpr uint32_t make_tag(LightKind kind, bool tabulated, uint32_t emitter) {
