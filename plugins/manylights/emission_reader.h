@@ -8,6 +8,7 @@
 #include "light.h"
 #include "parameter_reader.h"
 #include <cmath>
+#include <cstring>
 #include <mitsuba/core/spectrum.h>
 #include <vector>
 
@@ -15,20 +16,40 @@ namespace manylights {
 
 namespace dr = drjit;
 
-/// The value of a variable with one entry
-template <typename Float> float read_scalar(const Float &value) {
-    if constexpr (dr::is_jit_v<Float>) { // dr::slice makes variables on the way
-        dr::scalar_t<Float> number;
-        jit_var_read(value.index(), 0, &number);
-        return (float) number;
-    } else {
-        return (float) value;
+/// Values of variables that have one entry each
+template <typename Float, size_t Count>
+void read_scalars(const Float *const (&values)[Count], float (&out)[Count]) {
+    if constexpr (dr::is_llvm_v<Float>) {
+        // jit_var_read copies in a task of its own. All addresses before the first value:
+        // the processor then waits for the memory of all of them at once
+        VarInfo info[Count];
+        bool evaluated = true;
+        for (size_t i = 0; i < Count; ++i) {
+            info[i] = jit_set_backend(values[i]->index());
+            evaluated &= info[i].state == VarState::Evaluated;
+        }
+        if (evaluated) {
+            dr::sync_thread();
+            for (size_t i = 0; i < Count; ++i)
+                out[i] = (float) *(const dr::scalar_t<Float> *) info[i].data;
+            return;
+        }
+    }
+    for (size_t i = 0; i < Count; ++i) {
+        if constexpr (dr::is_jit_v<Float>) {
+            dr::scalar_t<Float> number;
+            jit_var_read(values[i]->index(), 0, &number);
+            out[i] = (float) number;
+        } else {
+            out[i] = (float) *values[i];
+        }
     }
 }
 
-template <typename T> void copy3(const T &value, float out[3]) {
-    for (size_t i = 0; i < 3; ++i)
-        out[i] = read_scalar(value.entry(i));
+template <typename Float> float read_scalar(const Float &value) {
+    float result[1];
+    read_scalars<Float, 1>({ &value }, result);
+    return result[0];
 }
 
 /// A buffer as it lies in memory; a copy only if that is a GPU's
@@ -99,14 +120,13 @@ template <typename Float, typename Spectrum> struct EmissionReader {
                 e.scale    = scale_of_d65(*d65);
                 e.color[2] = std::numeric_limits<float>::infinity(); // sigmoid of 1
                 if (has_color)
-                    copy3(*color, e.color);
+                    read_color(*color, e.color);
                 e.luminance = spectral_mean(e);
                 e.tabulated = true;
             }
         } else {
             if (type == "SRGBReflectanceSpectrum" && color) {
-                for (size_t i = 0; i < color->size(); ++i)
-                    e.color[i] = read_scalar(color->entry(i));
+                read_color(*color, e.color);
                 e.tabulated = true;
             } else if (const Float *value = params.find<Float>(name + ".value");
                        type == "UniformSpectrum" && value) {
@@ -130,6 +150,16 @@ template <typename Float, typename Spectrum> struct EmissionReader {
     }
 
 private:
+    template <typename Color> static void read_color(const Color &color, float out[3]) {
+        if constexpr (dr::size_v<Color> == 3) {
+            float values[3];
+            read_scalars({ &color.entry(0), &color.entry(1), &color.entry(2) }, values);
+            std::copy_n(values, 3, out);
+        } else {
+            out[0] = read_scalar(color.entry(0));
+        }
+    }
+
     static float d65_value(size_t i) {
         return (float) (mitsuba::d65_table[i] * MI_CIE_D65_NORMALIZATION);
     }

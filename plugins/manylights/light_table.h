@@ -111,9 +111,9 @@ private:
 
     void add(const Emitter *emitter, uint32_t index) {
         m_emitter    = index;
-        bool surface = has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface);
-        bool directional =
-            has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaDirection);
+        m_flags      = emitter->flags();
+        bool surface = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
+        bool directional = has_flag(m_flags, mitsuba::EmitterFlags::DeltaDirection);
         std::string_view name = emitter->class_name();
         if (surface && directional)
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
@@ -126,7 +126,7 @@ private:
         else if (name == "SpotLight")
             add_spot(emitter);
         else if (directional ||
-                 has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
+                 has_flag(m_flags, mitsuba::EmitterFlags::Infinite)) {
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
             Emission e = EmissionReader<Float, Spectrum>::read(emitter);
@@ -160,14 +160,14 @@ private:
     // ------------------------------------------------------------- Points and spots
 
     void add_point(const Emitter *emitter) {
-        ParameterReader params(emitter);
-        Emission e    = EmissionReader<Float, Spectrum>::read(emitter);
-        using Point3f = mitsuba::Point<Float, 3>;
-        const Point3f *position = params.find<Point3f>("position");
-        if (!position || !e.tabulated)
+        Emission e = EmissionReader<Float, Spectrum>::read(emitter);
+        if (!e.tabulated)
             return add_other(emitter);
         LightRow row = make_row(LightKind::Point, e);
-        copy3(*position, row.geometry);
+        // The emitter keeps its position on the host, too
+        auto position = emitter->bbox().min;
+        for (int i = 0; i < 3; ++i)
+            row.geometry[i] = (float) position[i];
         add_light(row, point_bounds(row.geometry));
     }
 
@@ -178,7 +178,7 @@ private:
                     *beam_deg   = params.find<Float>("beam_width");
         float matrix[3][4];
         bool textured =
-            has_flag(emitter->flags(), mitsuba::EmitterFlags::SpatiallyVarying);
+            has_flag(m_flags, mitsuba::EmitterFlags::SpatiallyVarying);
         if (!e.tabulated || textured || !cutoff_deg || !beam_deg ||
             !read_similarity(emitter->world_transform(), matrix))
             return add_other(emitter);
@@ -488,7 +488,7 @@ private:
         if (!can_sample(emitter))
             return add_only_hit();
         if (!find_bounds(emitter, low, high)) {
-            if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface))
+            if (has_flag(m_flags, mitsuba::EmitterFlags::Surface))
                 return add_only_hit();
             // Without a place it cannot be in the tree: always a candidate
             ++m_table.light_count;
@@ -566,12 +566,12 @@ private:
         }
     }
 
-    static bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
-                            ScalarPoint3f &high) {
+    bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
+                            ScalarPoint3f &high) const {
         auto box   = emitter->bbox();
         low        = box.min;
         high       = box.max;
-        bool delta = has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaPosition);
+        bool delta = has_flag(m_flags, mitsuba::EmitterFlags::DeltaPosition);
         if (!box.valid() && delta) { // projectors have no box, only a transformation
             auto position = emitter->world_transform().translation();
             for (int i = 0; i < 3; ++i)
@@ -669,8 +669,7 @@ private:
     void add_light(const LightRow &row, LightBounds bounds) {
         ++m_table.light_count;
         LightKind kind = (LightKind) (row.tag & kTagKindMask);
-        bool hit_able  = has_flag(m_scene->emitters()[m_emitter]->flags(),
-                                  mitsuba::EmitterFlags::Surface);
+        bool hit_able  = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
         m_table.can_be_hit |= hit_able;
@@ -696,6 +695,8 @@ private:
     /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
     bool m_only_hit    = false;
+    /// Flags of that emitter: asking for them makes a variable in JIT variants
+    uint32_t m_flags = 0;
     /// Is there a light with \ref kUnknownPower?
     bool m_unknown_powers = false;
     /// Lights that \ref note_invalid noted, and the index of the first one's emitter

@@ -155,17 +155,19 @@ public:
 
     static Fingerprint<Float> fingerprint(const Scene *scene) {
         Fingerprint<Float> result(scene->emitters().size());
+        dr::mask_t<Float> active(true);
         for (const auto &emitter : scene->emitters()) {
             const Shape *shape = emitter->shape();
             result.add_emitter(emitter.get());
-            result.mix(emitter->flags());
+            uint32_t flags = emitter->flags(active);
+            result.mix(flags);
             if (shape) {
                 result.add(shape);
                 result.mix(shape->has_flipped_normals());
             }
             // Kernels know them by number: another object may have got the address
             if constexpr (dr::is_jit_v<Float>)
-                if (shape || has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite))
+                if (shape || has_flag(flags, mitsuba::EmitterFlags::Infinite))
                     result.mix(jit_registry_id(shape ? (const void *) shape
                                                      : (const void *) emitter.get()));
         }
