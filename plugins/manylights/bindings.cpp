@@ -62,9 +62,7 @@ public:
                 "mean, flux, axis and variance must have the same length");
         if (count == 0)
             throw nb::value_error("a tree needs at least one light");
-        for (size_t i = 0; i < count; ++i)
-            if (!(flux(i) > 0) || !std::isfinite(flux(i)))
-                throw nb::value_error("flux must be positive and finite");
+        check_flux(flux);
         HostVector<LightBounds> bounds(count);
         for (size_t i = 0; i < count; ++i)
             bounds[i] = make_bounds(mean, flux(i), axis, variance(i), i);
@@ -79,7 +77,7 @@ public:
             rows[i].link                = m_tree.link[i];
             m_light_of[m_tree.order[i]] = i;
         }
-        m_view.nodes = load(m_wide.data(), m_wide.size() * kWideNodeFloats);
+        load_nodes();
         m_view.binary =
             load(m_tree.binary.data(), m_tree.binary.size() * kBinaryNodeFloats);
         m_view.rows        = load(rows.data(), count * kRowFloats);
@@ -124,6 +122,19 @@ public:
         });
     }
 
+    /// Other fluxes for the 4-wide nodes, which keep their places
+    void refit(const Numbers &flux) {
+        if (flux.shape(0) != m_light_of.size())
+            throw nb::value_error("flux must have one entry for each light");
+        check_flux(flux);
+        for (uint32_t i = 0; i < m_light_of.size(); ++i) {
+            uint32_t link                    = m_tree.link[i];
+            m_wide[link >> 2].flux[link & 3] = flux(m_tree.order[i]);
+        }
+        refit_tree(m_wide.data(), m_wide.size());
+        load_nodes();
+    }
+
     uint32_t depth() const { return m_tree.depth; }
     size_t node_count() const { return m_wide.size(); }
     std::vector<uint32_t> order() const {
@@ -137,6 +148,12 @@ public:
     }
 
 private:
+    static void check_flux(const Numbers &flux) {
+        for (size_t i = 0; i < flux.shape(0); ++i)
+            if (!(flux(i) > 0) || !std::isfinite(flux(i)))
+                throw nb::value_error("flux must be positive and finite");
+    }
+
     static LightBounds make_bounds(const Points &mean, float flux, const Points &axis,
                                    float variance, size_t i) {
         LightBounds bounds;
@@ -150,6 +167,10 @@ private:
         bounds.variance = variance;
         bounds.flux     = flux;
         return bounds;
+    }
+
+    void load_nodes() {
+        m_view.nodes = load(m_wide.data(), m_wide.size() * kWideNodeFloats);
     }
 
     static drjit::DynamicArray<float> load(const void *data, size_t size) {
@@ -250,6 +271,8 @@ NB_MODULE(_core, m) {
              "rate"_a, "xi"_a, "split_function"_a = "near", "transmits"_a = false,
              "Probability (N) that each light is a candidate of stochastic splitting, "
              "given xi.")
+        .def("refit", &Tree::refit, "flux"_a,
+             "Other fluxes (N, in the order of the input) without a new 4-wide tree.")
         .def_prop_ro("depth", &Tree::depth, "Levels of the 4-wide tree.")
         .def_prop_ro("node_count", &Tree::node_count, "Nodes of the 4-wide tree.")
         .def_prop_ro("order", &Tree::order, "Input index of each leaf, in tree order.")

@@ -23,7 +23,8 @@ class Hash {
 public:
     uint64_t value = 0xcbf29ce484222325ull;
 
-    void mix(uint64_t word) { // FNV-1a over 64-bit words, and a shift for their upper halves
+    void
+    mix(uint64_t word) { // FNV-1a over 64-bit words, and a shift for their upper halves
         value = (value ^ word) * 0x100000001b3ull;
         value ^= value >> 29;
     }

@@ -35,12 +35,11 @@ inline size_t chunk_count(size_t size, size_t chunk = kChunk) {
 }
 
 /// Call f(index of the chunk, begin, end) for all chunks of an array, at the same time
-template <typename F>
-void for_chunks(size_t size, const F &f, size_t chunk = kChunk) {
-    auto run = [&](size_t i) { f(i, i * chunk, std::min(size, (i + 1) * chunk)); };
+template <typename F> void for_chunks(size_t size, const F &f, size_t chunk = kChunk) {
+    auto run     = [&](size_t i) { f(i, i * chunk, std::min(size, (i + 1) * chunk)); };
     size_t count = chunk_count(size, chunk);
-    if (count == 1)
-        return run(0);
+    if (count <= 1)
+        return count == 1 ? run(0) : void();
     drjit::parallel_for(drjit::blocked_range<size_t>(0, count), [&](const auto &range) {
         for (size_t i : range)
             run(i);

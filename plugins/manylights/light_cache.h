@@ -142,9 +142,12 @@ private:
     /// If emitters have only become brighter or darker, and nobody uses the lights
     bool refit(Entry &entry, Fingerprint<Float> &fingerprint) const {
         if (m_keep_binary || entry.renderings > 0 ||
-            !fingerprint.same_places(entry.fingerprint) ||
-            !entry.lights->refit(entry.scene,
-                                 fingerprint.changed_emission(entry.fingerprint)))
+            !fingerprint.same_places(entry.fingerprint))
+            return false;
+        std::vector<uint32_t> changed = fingerprint.changed_emission(entry.fingerprint);
+        // Until it has succeeded they are the lights of no scene
+        entry.fingerprint = Fingerprint<Float>(0);
+        if (!entry.lights->refit(entry.scene, changed))
             return false;
         fingerprint.hold();
         entry.fingerprint = std::move(fingerprint);

@@ -42,7 +42,8 @@ inline float light_area(const LightRow &row, LightKind kind) {
 
 /// Power of a spot of intensity 1, uniform up to the middle of the transition
 inline float spot_power(float cutoff, float inverse_transition) {
-    float beam = inverse_transition < kHardEdge ? cutoff - 1 / inverse_transition : cutoff;
+    float beam =
+        inverse_transition < kHardEdge ? cutoff - 1 / inverse_transition : cutoff;
     // (1 - cos) as 2 sin^2, without cancellation
     float sin_beam = std::sin(.5f * beam), sin_cutoff = std::sin(.5f * cutoff);
     return 2 * kPi * (sin_beam * sin_beam + sin_cutoff * sin_cutoff);

@@ -110,10 +110,10 @@ private:
     }
 
     void add(const Emitter *emitter, uint32_t index) {
-        m_emitter    = index;
-        m_flags      = emitter->flags();
-        bool surface = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
-        bool directional = has_flag(m_flags, mitsuba::EmitterFlags::DeltaDirection);
+        m_emitter             = index;
+        m_flags               = emitter->flags();
+        bool surface          = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
+        bool directional      = has_flag(m_flags, mitsuba::EmitterFlags::DeltaDirection);
         std::string_view name = emitter->class_name();
         if (surface && directional)
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
@@ -125,8 +125,7 @@ private:
             add_point(emitter);
         else if (name == "SpotLight")
             add_spot(emitter);
-        else if (directional ||
-                 has_flag(m_flags, mitsuba::EmitterFlags::Infinite)) {
+        else if (directional || has_flag(m_flags, mitsuba::EmitterFlags::Infinite)) {
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
             Emission e = EmissionReader<Float, Spectrum>::read(emitter);
@@ -173,12 +172,11 @@ private:
 
     void add_spot(const Emitter *emitter) {
         ParameterReader params(emitter);
-        Emission e = EmissionReader<Float, Spectrum>::read(emitter);
+        Emission e              = EmissionReader<Float, Spectrum>::read(emitter);
         const Float *cutoff_deg = params.find<Float>("cutoff_angle"),
                     *beam_deg   = params.find<Float>("beam_width");
         float matrix[3][4];
-        bool textured =
-            has_flag(m_flags, mitsuba::EmitterFlags::SpatiallyVarying);
+        bool textured = has_flag(m_flags, mitsuba::EmitterFlags::SpatiallyVarying);
         if (!e.tabulated || textured || !cutoff_deg || !beam_deg ||
             !read_similarity(emitter->world_transform(), matrix))
             return add_other(emitter);
@@ -344,9 +342,10 @@ private:
         if (!constant.tabulated)
             varying = MeshEmission<Float, Spectrum>(emitter, mesh).read();
         bool flipped = mesh->has_flipped_normals();
-        add_triangles(faces.size() / 3, [&](size_t f, LightRow &row, LightBounds &bounds) {
+        add_triangles(faces.size() / 3, [&](size_t f, LightRow &row,
+                                            LightBounds &bounds) {
             const uint32_t *face = &faces[3 * f];
-            Side side = emitting_side(vertices.data(), normals.data(), face);
+            Side side            = emitting_side(vertices.data(), normals.data(), face);
             if (flipped && side != Side::Both)
                 side = side == Side::Front ? Side::Back : Side::Front;
             read_triangle(vertices.data(), face, varying.empty() ? constant : varying[f],
@@ -567,7 +566,7 @@ private:
     }
 
     bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
-                            ScalarPoint3f &high) const {
+                     ScalarPoint3f &high) const {
         auto box   = emitter->bbox();
         low        = box.min;
         high       = box.max;

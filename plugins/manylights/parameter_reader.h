@@ -30,8 +30,8 @@ private:
     /// Visits only what lies on the way: scenes have many emitters
     struct Search : mitsuba::TraversalCallback {
         std::string_view rest;
-        const void *value              = nullptr;
-        const std::type_info *type     = nullptr;
+        const void *value             = nullptr;
+        const std::type_info *type    = nullptr;
         const mitsuba::Object *object = nullptr;
 
         Search(const mitsuba::Object *root, std::string_view name) : rest(name) {

@@ -32,19 +32,18 @@ public:
         }
     }
 
-    /// The numbers of an array. They are copied if anything else still needs the array
-    Value *open(const Storage &array) {
+    /// The numbers of an array, which is taken away. They are copied if kernels that have
+    /// not run yet need the array as it is
+    Value *open(Storage &array) {
         if constexpr (dr::is_cuda_v<Storage>) {
             HostView view(array);
             m_copy.assign(view.data(), view.data() + view.size());
             return m_copy.data();
         } else {
-            m_array = array;
-            if constexpr (dr::is_jit_v<Storage>) {
-                constexpr uint32_t ours = 2; // `array` and `m_array`
-                if (jit_var_ref(array.index()) > ours)
-                    m_array = dr::load<Storage>(HostView(array).data(), array.size());
-            }
+            m_array = std::move(array);
+            if constexpr (dr::is_jit_v<Storage>)
+                if (jit_var_ref(m_array.index()) > 1)
+                    m_array = dr::load<Storage>(HostView(m_array).data(), m_array.size());
             return host_data();
         }
     }
@@ -129,7 +128,7 @@ public:
 
     /**
      * Follow a change of what some emitters emit, without a new tree: colours, fluxes and
-     * moments. False if that is not possible; what is left then is of no use.
+     * moments. False if that is not possible; the lights are then of no use any more.
      *
      * Lights with power stay where they are; those that had none are missing. Binary nodes
      * are not kept up to date.
@@ -139,15 +138,17 @@ public:
         std::vector<Emission> emission;
         std::vector<uint32_t> index(m_proportional.size(), kNone); // into `emission`
         for (uint32_t i : changed) {
-            Emission e =
-                EmissionReader<Float, Spectrum>::read(scene->emitters()[i].get());
+            const Emitter *emitter = scene->emitters()[i].get();
+            Emission e             = EmissionReader<Float, Spectrum>::read(emitter);
             if (!m_proportional[i] || !e.tabulated || !(e.luminance > 0) ||
                 !std::isfinite(e.luminance))
                 return false;
+            if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite))
+                continue;
             index[i] = (uint32_t) emission.size();
             emission.push_back(e);
         }
-        if (m_statistics.lights_in_tree > 0 && !refit(emission, index))
+        if (!emission.empty() && !refit(emission, index))
             return false;
         m_statistics.refit_ms = stopwatch.milliseconds();
         return true;

@@ -128,11 +128,9 @@ struct Subtree {
     }
 };
 
-/// Interior node of the binary tree: its cluster, without the box
+/// Interior node of the binary tree: what decides how it is collapsed
 struct Node {
-    float mean[3], variance, flux;
-    uint32_t axis;
-    float cost;
+    float cost, flux;
     /// First light of the right child
     uint32_t middle;
     /// Wide nodes of this subtree, if one begins here
@@ -189,13 +187,14 @@ public:
         Subtree root{ 0, count, 0 };
         split(root, m_centroids, 0);
 
-        Extent extent = measure(root);
+        Extent extent   = measure(root);
         tree.wide_count = extent.count;
         tree.depth      = extent.depth;
         tree.link.resize(count);
         m_wide = memory(tree.wide_count);
         m_link = tree.link.data();
         collapse(root, 0, kNone);
+        refit_tree(m_wide, tree.wide_count);
         if (keep_binary) {
             tree.binary.reserve(2 * (size_t) count - 1);
             write_binary(tree.binary, root);
@@ -210,10 +209,9 @@ public:
     }
 
 private:
-    /// Flux as a fraction of the sum, and the axis weighted with it
+    /// Weight the axis with the flux as a fraction of the sum
     static void normalize(LightBounds &light, double sum) {
-        light.flux   = flux_share(light.flux, sum);
-        light.weight = light.flux * kFluxScale;
+        light.weight = flux_share(light.flux, sum) * kFluxScale;
         for (float &coordinate : light.axis)
             coordinate *= light.weight;
     }
@@ -227,26 +225,9 @@ private:
             c.axis[i]    = light.axis[i] / light.weight;
         }
         c.variance = light.variance;
-        c.flux     = light.flux;
+        c.flux     = light.weight / kFluxScale;
         c.cost     = 0;
         return c;
-    }
-
-    /// The cluster of a subtree, for the nodes that are written: without a box and a cost
-    Cluster cluster(const Subtree &tree) const {
-        if (tree.is_leaf())
-            return leaf_cluster(m_lights[tree.begin]);
-        const Node &node = m_nodes[tree.node];
-        Cluster c{};
-        std::copy_n(node.mean, 3, c.mean);
-        c.variance = node.variance;
-        c.flux     = node.flux;
-        return c;
-    }
-
-    uint32_t packed_axis(const Subtree &tree) const {
-        return tree.is_leaf() ? pack_axis(leaf_cluster(m_lights[tree.begin]).axis)
-                              : m_nodes[tree.node].axis;
     }
 
     // ---------------------------------------------------------------------- Binary tree
@@ -277,18 +258,9 @@ private:
             split_left();
         right_cluster = split(right, right_centroids, depth + 1);
         tasks.wait();
-        Cluster c = join(left_cluster, right_cluster);
-        write_node(m_nodes[tree.node], c, middle);
+        Cluster c          = join(left_cluster, right_cluster);
+        m_nodes[tree.node] = { c.cost, c.flux, middle, 0 };
         return c;
-    }
-
-    static void write_node(Node &node, const Cluster &c, uint32_t middle) {
-        std::copy_n(c.mean, 3, node.mean);
-        node.variance = c.variance;
-        node.flux     = c.flux;
-        node.axis     = pack_axis(c.axis);
-        node.cost     = c.cost;
-        node.middle   = middle;
     }
 
     /// Two lights lie in the order of their coordinates, whatever the input's order was
@@ -431,7 +403,7 @@ private:
     /// Note how many wide nodes there are in each subtree at which one begins
     Extent measure(const Subtree &root) {
         std::array<Subtree, 4> children{ root };
-        uint32_t count = open_children(children);
+        uint32_t count  = open_children(children);
         Extent below[4] = {}, sum{ 1, 0 };
         for_interior(children, count,
                      [&](uint32_t slot) { below[slot] = measure(children[slot]); });
@@ -445,7 +417,7 @@ private:
         return sum;
     }
 
-    /// Write the wide nodes of a subtree, parents first
+    /// Write the wide nodes of a subtree, parents first, with the moments of leaves alone
     void collapse(const Subtree &root, uint32_t index, uint32_t link) const {
         std::array<Subtree, 4> children{ root };
         uint32_t count = open_children(children);
@@ -454,8 +426,8 @@ private:
         uint32_t next = index + 1;
         for (uint32_t slot = 0; slot < count; ++slot) {
             const Subtree &child = children[slot];
-            write_child(node, slot, child);
             if (child.is_leaf()) {
+                write_leaf(node, slot, m_lights[child.begin]);
                 node.child[slot]    = kLeafBit | child.begin;
                 m_link[child.begin] = 4 * index + slot;
             } else {
@@ -467,6 +439,14 @@ private:
         for_interior(children, count, [&](uint32_t slot) {
             collapse(children[slot], node.child[slot], 4 * index + slot);
         });
+    }
+
+    static void write_leaf(WideNode &node, uint32_t slot, const LightBounds &light) {
+        for (int i = 0; i < 3; ++i)
+            node.mean[i][slot] = light.mean[i];
+        node.variance[slot] = light.variance;
+        node.flux[slot]     = light.flux;
+        node.axis[slot]     = pack_axis(leaf_cluster(light).axis);
     }
 
     /// Replace the costliest interior entry by its two children until there are four
@@ -498,48 +478,36 @@ private:
         return x.cost != y.cost ? x.cost > y.cost : x.flux > y.flux;
     }
 
-    void write_child(WideNode &node, uint32_t slot, const Subtree &tree) const {
-        Cluster c = cluster(tree);
-        for (int i = 0; i < 3; ++i)
-            node.mean[i][slot] = c.mean[i];
-        node.variance[slot] = c.variance;
-        node.flux[slot]     = c.flux;
-        node.axis[slot]     = packed_axis(tree);
-    }
-
-    /// Append the nodes of a subtree, leaves included
-    void write_binary(std::vector<BinaryNode> &nodes, const Subtree &tree) const {
-        Cluster c = cluster(tree);
+    /// Append the nodes of a subtree, leaves included; returns its cluster
+    Cluster write_binary(std::vector<BinaryNode> &nodes, const Subtree &tree) const {
+        uint32_t index = (uint32_t) nodes.size(),
+                 most  = 2 * (uint32_t) m_lights.size() - 1;
+        nodes.emplace_back();
         BinaryNode node{};
+        node.first  = tree.begin;
+        node.right  = kNone;
+        node.light  = tree.is_leaf() ? tree.begin : kNone;
+        node.escape = index + 2 * tree.count() - 1;
+        if (node.escape == most)
+            node.escape = kNone;
+        Cluster c;
+        if (tree.is_leaf()) {
+            c = leaf_cluster(m_lights[tree.begin]);
+        } else {
+            uint32_t middle = m_nodes[tree.node].middle;
+            Subtree left    = tree.left(middle);
+            node.right      = index + 2 * left.count();
+            c               = write_binary(nodes, left);
+            c               = join(c, write_binary(nodes, tree.right(middle)));
+        }
         std::copy_n(c.box_min, 3, node.box_min);
         std::copy_n(c.box_max, 3, node.box_max);
         std::copy_n(c.mean, 3, node.mean);
-        node.variance  = c.variance;
-        node.flux      = c.flux;
-        node.axis      = packed_axis(tree);
-        node.first     = tree.begin;
-        node.right     = kNone;
-        node.light     = tree.is_leaf() ? tree.begin : kNone;
-        uint32_t index = (uint32_t) nodes.size(),
-                 most  = 2 * (uint32_t) m_lights.size() - 1;
-        node.escape    = index + 2 * tree.count() - 1;
-        if (node.escape == most)
-            node.escape = kNone;
-        nodes.push_back(node);
-        if (tree.is_leaf())
-            return;
-        uint32_t middle    = m_nodes[tree.node].middle;
-        Subtree left       = tree.left(middle);
-        uint32_t right     = index + 2 * left.count();
-        nodes[index].right = right;
-        write_binary(nodes, left);
-        write_binary(nodes, tree.right(middle));
-        for (int i = 0; i < 3; ++i) {
-            nodes[index].box_min[i] =
-                std::min(nodes[index + 1].box_min[i], nodes[right].box_min[i]);
-            nodes[index].box_max[i] =
-                std::max(nodes[index + 1].box_max[i], nodes[right].box_max[i]);
-        }
+        node.variance = c.variance;
+        node.flux     = c.flux;
+        node.axis     = pack_axis(c.axis);
+        nodes[index]  = node;
+        return c;
     }
 
     HostVector<LightBounds> m_lights;
@@ -563,8 +531,7 @@ void refit_parent(WideNode *nodes, const WideNode &node) {
         flux += node.flux[slot];
         for (int i = 0; i < 3; ++i) {
             mean[i] += (double) node.flux[slot] * node.mean[i][slot];
-            axis[i] +=
-                (double) node.flux[slot] * unpack_coordinate(node.axis[slot], i);
+            axis[i] += (double) node.flux[slot] * unpack_coordinate(node.axis[slot], i);
         }
     }
     for (double &coordinate : mean)

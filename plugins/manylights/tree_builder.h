@@ -93,9 +93,9 @@ LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
                      bool keep_binary);
 
 /**
- * New fluxes for a tree whose lights stay in place: at each leaf, `WideNode::flux` holds
- * the light's flux, in any unit. Topology, mean positions, variances and axes of the
- * leaves are kept; everything above them is computed from the bottom up.
+ * Fill a tree from the bottom up, after building it or after a change of fluxes: in the
+ * leaves' slots, `WideNode::flux` is the flux in any unit, which becomes a fraction of the
+ * sum; all other slots get the moments of the nodes below them.
  */
 void refit_tree(WideNode *nodes, size_t count);
 
