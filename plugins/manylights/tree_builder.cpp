@@ -137,23 +137,6 @@ struct Node {
     uint32_t wide_count;
 };
 
-/// Tasks that run at the same time as what follows
-class Tasks {
-public:
-    template <typename F> void start(const F &f) {
-        m_tasks[m_count++] = drjit::do_async(f);
-    }
-    void wait() {
-        while (m_count > 0)
-            task_wait_and_release(m_tasks[--m_count]);
-    }
-    ~Tasks() { wait(); }
-
-private:
-    Task *m_tasks[4];
-    uint32_t m_count = 0;
-};
-
 class Builder {
 public:
     explicit Builder(HostVector<LightBounds> &&lights) : m_lights(std::move(lights)) {
@@ -583,7 +566,10 @@ void refit_subtree(WideNode *nodes, size_t begin, size_t end) {
 
 LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
                      bool keep_binary) {
-    return Builder(std::move(lights)).build(memory, keep_binary);
+    LightTree tree;
+    run_with_denormals(
+        [&] { tree = Builder(std::move(lights)).build(memory, keep_binary); });
+    return tree;
 }
 
 void refit_tree(WideNode *nodes, size_t count) {
@@ -600,7 +586,7 @@ void refit_tree(WideNode *nodes, size_t count) {
     for_leaves([&](size_t chunk, float leaf) { flux[chunk] += leaf; });
     double sum = std::accumulate(flux.begin(), flux.end(), 0.0);
     for_leaves([&](size_t, float &leaf) { leaf = flux_share(leaf, sum); });
-    refit_subtree(nodes, 0, count);
+    run_with_denormals([&] { refit_subtree(nodes, 0, count); });
 }
 
 uint32_t pack_axis(const float axis[3]) {
