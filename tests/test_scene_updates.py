@@ -11,8 +11,11 @@ all lights change by the same power of two.
 
 import gc
 import re
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -548,6 +551,35 @@ def test_mean_under_nesting(variant, nesting):
     lower_points(scene)
     known = nested(nesting, reference())
     assert_right_mean(scene, integrator, known, f"{nesting}, {variant}", channels=slice(0, 3))
+
+
+LARGE = """
+import mitsuba as mi, numpy as np, manylights
+mi.set_variant("scalar_rgb")
+from tests import light_scenes as scenes
+corners = np.random.default_rng(1).random((100_000, 1, 3)) + [0, 0, 1] + 0.01 * np.eye(3)
+scene = mi.load_dict({**scenes.stage(), "lamps": scenes.make_mesh(corners, scenes.rgb([1, 1, 1]))})
+for _ in range(3):
+    inner = mi.load_dict({"type": "manylights_direct"})
+    mi.render(scene, integrator=mi.load_dict({"type": "moment", "image": inner}), spp=1)
+print("done")
+"""
+
+
+def test_large_tree_under_nesting():
+    """One of the threads that render builds the tree: those that wait must not wait for it.
+
+    A thread with nothing else to do while it builds would take up pixels, and hang.
+    """
+    process = subprocess.run(
+        [sys.executable, "-c", LARGE],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert process.stdout.split()[-1:] == ["done"], process.stderr
 
 
 # ----------------------------------------------------------------------------------------- freezing
