@@ -226,6 +226,77 @@ def test_unit_of_flux_does_not_matter():
     assert trees[0].nodes == trees[1].nodes == trees[2].nodes
 
 
+def test_refit_to_the_same_fluxes_changes_nothing():
+    """Nor does another unit of flux: building a tree ends with the same pass."""
+    mean, flux, axis, variance = random_lights(500)
+    flux = flux.astype(np.float32)
+    tree = make_tree(mean, flux, axis, variance)
+    nodes = tree.nodes
+    for factor in (1, 2.0**60, 2.0**-60):
+        tree.refit(flux * np.float32(factor))
+        assert tree.nodes == nodes
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 1000, 40_000])
+def test_probabilities_after_refits(count):
+    """They sum to one, each light can be chosen, and nothing drifts."""
+    mean, flux, axis, variance = random_lights(count)
+    flux = flux.astype(np.float32)
+    tree = make_tree(mean, flux, axis, variance)
+    nodes = tree.nodes
+    for seed in range(3):
+        other = random_lights(count, seed + 1, decades=12)[1].astype(np.float32)
+        tree.refit(other)
+        for at in RECEIVERS.values():
+            assert_distribution(tree, at)
+    tree.refit(flux)
+    assert tree.nodes == nodes
+
+
+def test_moments_after_a_refit():
+    """Flux, mean position, variance and axis of the root's children are those of their lights."""
+    mean, flux, axis, variance = random_lights(300)
+    tree = make_tree(mean, flux, axis, variance)
+    other = 10 ** np.random.default_rng(9).uniform(-4, 0, 300)
+    tree.refit(other.astype(np.float32))
+    words = np.frombuffer(tree.nodes, np.uint32).reshape(-1, 32)
+    numbers = words.view(np.float32)
+    share = other / other.sum()
+    for slot in range(4):
+        lights = np.array(tree.order)[lights_below(words, words[0, 24 + slot])]
+        weights = share[lights] / share[lights].sum()
+        center = weights @ mean[lights]
+        spread = variance[lights] + ((mean[lights] - center) ** 2).sum(axis=1) / 3
+        np.testing.assert_allclose(numbers[0, 16 + slot], share[lights].sum(), rtol=1e-5)
+        np.testing.assert_allclose(numbers[0, slot:12:4], center, rtol=1e-5)
+        np.testing.assert_allclose(numbers[0, 12 + slot], weights @ spread, rtol=1e-4)
+        packed = [words[0, 20 + slot] >> np.uint32(10 * k) & 1023 for k in range(3)]
+        found = [(int(p) - 1024 * (p > 511)) / 511 for p in packed]
+        # Each level rounds to steps of 1 / 511
+        assert np.abs(found - weights @ axis[lights]).max() <= tree.depth / 1022
+
+
+def lights_below(words, child):
+    """Numbers of the lights below an entry `child` of a node."""
+    if child & 0x80000000:
+        return [int(child & 0x7FFFFFFF)]
+    node = words[child]
+    return [
+        light
+        for slot in range(4)
+        if node[16 + slot]
+        for light in lights_below(words, node[24 + slot])
+    ]
+
+
+def test_refit_refuses_what_a_tree_refuses():
+    """One positive flux for each light."""
+    tree = make_tree(*random_lights(5))
+    for flux in (np.ones(4), np.zeros(5), np.full(5, np.nan)):
+        with pytest.raises(ValueError, match="flux"):
+            tree.refit(flux.astype(np.float32))
+
+
 shapes = st.sampled_from(["cube", "line", "coincident", "exponential"])
 coordinates = st.floats(-2, 2, width=32)
 places = st.tuples(coordinates, coordinates, coordinates)

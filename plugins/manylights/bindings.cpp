@@ -62,22 +62,24 @@ public:
                 "mean, flux, axis and variance must have the same length");
         if (count == 0)
             throw nb::value_error("a tree needs at least one light");
-        for (size_t i = 0; i < count; ++i)
-            if (!(flux(i) > 0) || !std::isfinite(flux(i)))
-                throw nb::value_error("flux must be positive and finite");
-        std::vector<LightBounds> bounds(count);
+        check_flux(flux);
+        HostVector<LightBounds> bounds(count);
         for (size_t i = 0; i < count; ++i)
             bounds[i] = make_bounds(mean, flux(i), axis, variance(i), i);
-        m_tree = build_tree(bounds, /* keep_binary = */ true);
+        auto memory = [this](size_t nodes) {
+            m_wide.resize(nodes);
+            return m_wide.data();
+        };
+        m_tree = build_tree(std::move(bounds), memory, /* keep_binary = */ true);
         std::vector<LightRow> rows(count);
         m_light_of.resize(count);
         for (uint32_t i = 0; i < count; ++i) {
             rows[i].link                = m_tree.link[i];
             m_light_of[m_tree.order[i]] = i;
         }
+        load_nodes();
         m_view.node_links = dr::load<dr::DynamicArray<uint32_t>>(m_tree.node_link.data(),
                                                                  m_tree.node_link.size());
-        m_view.nodes = load(m_tree.wide.data(), m_tree.wide.size() * kWideNodeFloats);
         m_view.binary =
             load(m_tree.binary.data(), m_tree.binary.size() * kBinaryNodeFloats);
         m_view.rows        = load(rows.data(), count * kRowFloats);
@@ -122,17 +124,37 @@ public:
         });
     }
 
+    /// Other fluxes for the 4-wide nodes, which keep their places
+    void refit(const Numbers &flux) {
+        if (flux.shape(0) != m_light_of.size())
+            throw nb::value_error("flux must have one entry for each light");
+        check_flux(flux);
+        HostVector<float> ordered(m_light_of.size());
+        for (uint32_t i = 0; i < ordered.size(); ++i)
+            ordered[i] = flux(m_tree.order[i]);
+        refit_tree(m_wide.data(), m_wide.size(), ordered);
+        load_nodes();
+    }
+
     uint32_t depth() const { return m_tree.depth; }
-    size_t node_count() const { return m_tree.wide.size(); }
-    const std::vector<uint32_t> &order() const { return m_tree.order; }
+    size_t node_count() const { return m_wide.size(); }
+    std::vector<uint32_t> order() const {
+        return { m_tree.order.begin(), m_tree.order.end() };
+    }
     nb::bytes nodes() const {
-        return nb::bytes(m_tree.wide.data(), m_tree.wide.size() * sizeof(WideNode));
+        return nb::bytes(m_wide.data(), m_wide.size() * sizeof(WideNode));
     }
     nb::bytes binary_nodes() const {
         return nb::bytes(m_tree.binary.data(), m_tree.binary.size() * sizeof(BinaryNode));
     }
 
 private:
+    static void check_flux(const Numbers &flux) {
+        for (size_t i = 0; i < flux.shape(0); ++i)
+            if (!(flux(i) > 0) || !std::isfinite(flux(i)))
+                throw nb::value_error("flux must be positive and finite");
+    }
+
     static LightBounds make_bounds(const Points &mean, float flux, const Points &axis,
                                    float variance, size_t i) {
         LightBounds bounds;
@@ -146,6 +168,10 @@ private:
         bounds.variance = variance;
         bounds.flux     = flux;
         return bounds;
+    }
+
+    void load_nodes() {
+        m_view.nodes = load(m_wide.data(), m_wide.size() * kWideNodeFloats);
     }
 
     static drjit::DynamicArray<float> load(const void *data, size_t size) {
@@ -174,6 +200,7 @@ private:
     }
 
     LightTree m_tree;
+    std::vector<WideNode> m_wide;
     TreeView<float> m_view;
     std::vector<uint32_t> m_light_of;
 };
@@ -245,6 +272,8 @@ NB_MODULE(_core, m) {
              "rate"_a, "xi"_a, "split_function"_a = "near", "transmits"_a = false,
              "Probability (N) that each light is a candidate of stochastic splitting, "
              "given xi.")
+        .def("refit", &Tree::refit, "flux"_a,
+             "Other fluxes (N, in the order of the input) without a new 4-wide tree.")
         .def_prop_ro("depth", &Tree::depth, "Levels of the 4-wide tree.")
         .def_prop_ro("node_count", &Tree::node_count, "Nodes of the 4-wide tree.")
         .def_prop_ro("order", &Tree::order, "Input index of each leaf, in tree order.")

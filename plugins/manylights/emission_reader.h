@@ -8,6 +8,7 @@
 #include "light.h"
 #include "parameter_reader.h"
 #include <cmath>
+#include <cstring>
 #include <mitsuba/core/spectrum.h>
 #include <vector>
 
@@ -15,23 +16,70 @@ namespace manylights {
 
 namespace dr = drjit;
 
-/// The value of a variable with one entry
+/// Values of variables that have one entry each
+template <typename Float, size_t Count>
+void read_scalars(const Float *const (&values)[Count], float (&out)[Count]) {
+    if constexpr (dr::is_llvm_v<Float>) {
+        // jit_var_read copies in a task of its own. All addresses before the first value:
+        // the processor then waits for the memory of all of them at once
+        VarInfo info[Count];
+        bool evaluated = true;
+        for (size_t i = 0; i < Count; ++i) {
+            info[i] = jit_set_backend(values[i]->index());
+            evaluated &= info[i].state == VarState::Evaluated;
+        }
+        if (evaluated) {
+            dr::sync_thread();
+            for (size_t i = 0; i < Count; ++i)
+                out[i] = (float) *(const dr::scalar_t<Float> *) info[i].data;
+            return;
+        }
+    }
+    for (size_t i = 0; i < Count; ++i) {
+        if constexpr (dr::is_jit_v<Float>) {
+            dr::scalar_t<Float> number;
+            jit_var_read(values[i]->index(), 0, &number);
+            out[i] = (float) number;
+        } else {
+            out[i] = (float) *values[i];
+        }
+    }
+}
+
 template <typename Float> float read_scalar(const Float &value) {
-    return (float) dr::slice(value, 0);
+    float result[1];
+    read_scalars<Float, 1>({ &value }, result);
+    return result[0];
 }
 
-template <typename T> void copy3(const T &value, float out[3]) {
-    for (size_t i = 0; i < 3; ++i)
-        out[i] = read_scalar(value.entry(i));
-}
+/// A buffer as it lies in memory; a copy only if that is a GPU's
+template <typename Buffer> class HostView {
+public:
+    using T = dr::scalar_t<Buffer>;
 
-/// A copy of a buffer on the host
-template <typename T, typename Buffer> std::vector<T> download(const Buffer &buffer) {
-    auto host = dr::migrate(buffer, JitBackend::None);
-    if constexpr (dr::is_jit_v<Buffer>)
-        dr::sync_thread();
-    return std::vector<T>(host.data(), host.data() + dr::width(buffer));
-}
+    explicit HostView(const Buffer &buffer) : m_size(dr::width(buffer)) {
+        if (m_size == 0)
+            return;
+        if constexpr (dr::is_jit_v<Buffer>) {
+            m_kept = dr::detach<false>(buffer);
+            if constexpr (dr::is_cuda_v<Buffer>)
+                m_kept = dr::migrate(m_kept, JitBackend::None);
+            m_data = m_kept.data();
+            dr::sync_thread();
+        } else {
+            m_data = buffer.data();
+        }
+    }
+    const T *data() const { return m_data; }
+    size_t size() const { return m_size; }
+    const T &operator[](size_t i) const { return m_data[i]; }
+
+private:
+    struct Nothing {};
+    std::conditional_t<dr::is_jit_v<Buffer>, dr::detached_t<Buffer>, Nothing> m_kept;
+    const T *m_data = nullptr;
+    size_t m_size;
+};
 
 /// Emission that does not vary over the emitter
 struct Emission {
@@ -41,7 +89,19 @@ struct Emission {
     bool tabulated = false;
 };
 
+/// Names of the textures that make emitters shine
+constexpr std::string_view kEmissionNames[] = { "intensity", "radiance", "irradiance" };
+
 template <typename Float, typename Spectrum> struct EmissionReader {
+    /// Radiance, intensity or irradiance of an emitter; not tabulated if it has none of these
+    static Emission read(const mitsuba::Object *emitter) {
+        ParameterReader params(emitter);
+        for (std::string_view name : kEmissionNames)
+            if (params.object(name))
+                return read(params, std::string(name));
+        return {};
+    }
+
     /// Emission from the texture `name`; not tabulated if it varies or has another spectrum
     static Emission read(const ParameterReader &params, const std::string &name) {
         Emission e;
@@ -60,14 +120,13 @@ template <typename Float, typename Spectrum> struct EmissionReader {
                 e.scale    = scale_of_d65(*d65);
                 e.color[2] = std::numeric_limits<float>::infinity(); // sigmoid of 1
                 if (has_color)
-                    copy3(*color, e.color);
+                    read_color(*color, e.color);
                 e.luminance = spectral_mean(e);
                 e.tabulated = true;
             }
         } else {
             if (type == "SRGBReflectanceSpectrum" && color) {
-                for (size_t i = 0; i < color->size(); ++i)
-                    e.color[i] = read_scalar(color->entry(i));
+                read_color(*color, e.color);
                 e.tabulated = true;
             } else if (const Float *value = params.find<Float>(name + ".value");
                        type == "UniformSpectrum" && value) {
@@ -90,6 +149,16 @@ template <typename Float, typename Spectrum> struct EmissionReader {
     }
 
 private:
+    template <typename Color> static void read_color(const Color &color, float out[3]) {
+        if constexpr (dr::size_v<Color> == 3) {
+            float values[3];
+            read_scalars({ &color.entry(0), &color.entry(1), &color.entry(2) }, values);
+            std::copy_n(values, 3, out);
+        } else {
+            out[0] = read_scalar(color.entry(0));
+        }
+    }
+
     static float d65_value(size_t i) {
         return (float) (mitsuba::d65_table[i] * MI_CIE_D65_NORMALIZATION);
     }

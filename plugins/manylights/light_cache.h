@@ -2,7 +2,8 @@
 
 /**
  * Lights of the scenes that an integrator has met: built when a scene is first rendered,
- * and again when its emitters or their shapes have changed.
+ * and again when its emitters or their shapes have changed. Where only the emission of
+ * some emitters has changed, the tree stays and gets new fluxes.
  *
  * Mitsuba has no hook before rendering. `render()` holds a \ref Rendering, which compares a
  * fingerprint of the emitters once. Other integrators (`moment`, `stokes`) call `sample()`
@@ -126,14 +127,32 @@ private:
         }
     };
 
-    /// Make the lights of a scene current, and build them if they are new or changed
+    /// Make the lights of a scene current, and build or refit them if they are new or changed
     Entry &update(const Scene *scene) const {
         refuse_freezing();
         Fingerprint<Float> fingerprint = Lights::fingerprint(scene);
         for (const auto &entry : m_entries)
-            if (entry && entry->scene == scene && entry->fingerprint == fingerprint)
+            if (entry && entry->scene == scene &&
+                (entry->fingerprint == fingerprint || refit(*entry, fingerprint)))
                 return select(entry.get());
+        fingerprint.hold();
         return select(build(scene, std::move(fingerprint)));
+    }
+
+    /// If emitters have only become brighter or darker, and nobody uses the lights
+    bool refit(Entry &entry, Fingerprint<Float> &fingerprint) const {
+        if (m_keep_binary || entry.renderings > 0 ||
+            !fingerprint.same_places(entry.fingerprint))
+            return false;
+        std::vector<uint32_t> changed = fingerprint.changed_emission(entry.fingerprint);
+        // Until it has succeeded they are the lights of no scene
+        entry.fingerprint = Fingerprint<Float>(0);
+        if (!entry.lights->refit(entry.scene, changed))
+            return false;
+        fingerprint.hold();
+        entry.fingerprint = std::move(fingerprint);
+        Log(mitsuba::Info, "%s", describe(entry.lights->statistics()));
+        return true;
     }
 
     /// Takes the place of this scene's old lights, or of the scene that was built before last
@@ -174,7 +193,9 @@ private:
             << ", lights_in_tree = " << s.lights_in_tree << ", nodes = " << s.nodes
             << ", depth = " << s.depth
             << ", memory = " << mitsuba::util::mem_string((size_t) s.bytes)
-            << ", built in " << mitsuba::util::time_string(s.build_ms, true) << "]";
+            << (s.refit_ms > 0 ? ", refit in " : ", built in ")
+            << mitsuba::util::time_string(s.refit_ms > 0 ? s.refit_ms : s.build_ms, true)
+            << "]";
         return oss.str();
     }
 

@@ -14,6 +14,9 @@
  * of its plugins have no headers.
  */
 
+#include "host_memory.h"
+#include "importance.h"
+#include "light_flux.h"
 #include "mesh_emission.h"
 #include <cstring>
 #include <mitsuba/core/logger.h>
@@ -35,13 +38,17 @@ template <typename Float, typename Spectrum> struct HostTable {
     using Emitter = mitsuba::Emitter<Float, Spectrum>;
     using Shape   = mitsuba::Shape<Float, Spectrum>;
 
-    std::vector<LightRow> rows;
-    std::vector<LightBounds> bounds;
+    HostVector<LightRow> rows;
+    HostVector<LightBounds> bounds;
+    KindSet kinds;
     /// Emitters without a place: environments, suns, directional lights
     std::vector<const Emitter *> infinite;
     std::vector<ShapeLights<Shape>> shapes;
     /// Index into `rows`, kOnlyHit, or kNone for a primitive that does not emit
-    std::vector<uint32_t> light_of_primitive;
+    HostVector<uint32_t> light_of_primitive;
+    /// Emitters whose emission is in proportion to that of each of their lights, of which
+    /// none was left out
+    std::vector<bool> proportional;
     /// Lights of any kind, those left out of the tree included
     uint32_t light_count = 0;
     /// Is there an emissive surface whose radiance is not in the table?
@@ -65,6 +72,7 @@ public:
         LightTableReader reader;
         reader.m_scene       = scene;
         const auto &emitters = scene->emitters();
+        reader.reserve();
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
         if (!reader.m_table.beams)
@@ -75,24 +83,37 @@ public:
     }
 
 private:
+    /// Memory for as many lights as there may be: growing would need twice as much
+    void reserve() {
+        size_t count = 0;
+        for (const auto &emitter : m_scene->emitters()) {
+            const Shape *shape = emitter->shape();
+            count += shape && shape->is_mesh() ? ((const Mesh *) shape)->face_count() : 1;
+        }
+        m_table.rows.reserve(count);
+        m_table.bounds.reserve(count);
+        m_table.light_of_primitive.reserve(count);
+        m_table.proportional.resize(m_scene->emitters().size(), false);
+    }
+
     /// Without narrow spots: unit axes, and the weights of spots (see LightBounds)
     void take_lobes_for_cosines() {
-        for (size_t i = 0; i < m_table.rows.size(); ++i) {
-            LightBounds &bounds = m_table.bounds[i];
-            const LightRow &row = m_table.rows[i];
-            float length = std::hypot(bounds.axis[0], bounds.axis[1], bounds.axis[2]);
-            for (float &coordinate : bounds.axis)
-                coordinate /= length > 0 ? length : 1.f;
-            if ((row.tag & kTagKindMask) == (uint32_t) LightKind::Spot)
-                bounds.flux = std::sqrt(bounds.flux * 4 * dr::Pi<float> * row.luminance);
-        }
+        for_chunks(m_table.rows.size(), [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i) {
+                LightBounds &bounds = m_table.bounds[i];
+                float length        = norm(bounds.axis);
+                for (float &coordinate : bounds.axis)
+                    coordinate /= length > 0 ? length : 1.f;
+                bounds.flux = light_flux(m_table.rows[i], /* beams = */ false);
+            }
+        });
     }
 
     void add(const Emitter *emitter, uint32_t index) {
-        m_emitter    = index;
-        bool surface = has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface);
-        bool directional =
-            has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaDirection);
+        m_emitter             = index;
+        m_flags               = emitter->flags();
+        bool surface          = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
+        bool directional      = has_flag(m_flags, mitsuba::EmitterFlags::DeltaDirection);
         std::string_view name = emitter->class_name();
         if (surface && directional)
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
@@ -104,23 +125,23 @@ private:
             add_point(emitter);
         else if (name == "SpotLight")
             add_spot(emitter);
-        else if (directional ||
-                 has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite)) {
+        else if (directional || has_flag(m_flags, mitsuba::EmitterFlags::Infinite)) {
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
-            ParameterReader params(emitter);
-            for (const char *name : { "irradiance", "radiance" })
-                check(EmissionReader<Float, Spectrum>::read(params, name).luminance);
+            Emission e = EmissionReader<Float, Spectrum>::read(emitter);
+            note_invalid(!is_valid(e.luminance));
+            m_table.proportional[index] = e.tabulated && e.luminance > 0;
         } else
             add_other(emitter);
     }
 
-    /// Note a light whose power is not a finite number >= 0
-    void check(float power) {
-        if (std::isfinite(power) && power >= 0)
-            return;
-        if (m_invalid++ == 0)
+    static bool is_valid(float power) { return std::isfinite(power) && power >= 0; }
+
+    /// Note lights of the current emitter whose power is not a finite number >= 0
+    void note_invalid(uint32_t count) {
+        if (count > 0 && m_invalid == 0)
             m_first_invalid = m_emitter;
+        m_invalid += count;
     }
 
     /// Without a word they would just be missing from the image
@@ -138,27 +159,24 @@ private:
     // ------------------------------------------------------------- Points and spots
 
     void add_point(const Emitter *emitter) {
-        ParameterReader params(emitter);
-        Emission e    = EmissionReader<Float, Spectrum>::read(params, "intensity");
-        using Point3f = mitsuba::Point<Float, 3>;
-        const Point3f *position = params.find<Point3f>("position");
-        if (!position || !e.tabulated)
+        Emission e = EmissionReader<Float, Spectrum>::read(emitter);
+        if (!e.tabulated)
             return add_other(emitter);
         LightRow row = make_row(LightKind::Point, e);
-        copy3(*position, row.geometry);
-        LightBounds bounds = point_bounds(row.geometry);
-        bounds.flux        = 4 * dr::Pi<float> * e.luminance;
-        add_light(row, bounds);
+        // The emitter keeps its position on the host, too
+        auto position = emitter->bbox().min;
+        for (int i = 0; i < 3; ++i)
+            row.geometry[i] = (float) position[i];
+        add_light(row, point_bounds(row.geometry));
     }
 
     void add_spot(const Emitter *emitter) {
         ParameterReader params(emitter);
-        Emission e = EmissionReader<Float, Spectrum>::read(params, "intensity");
+        Emission e              = EmissionReader<Float, Spectrum>::read(emitter);
         const Float *cutoff_deg = params.find<Float>("cutoff_angle"),
                     *beam_deg   = params.find<Float>("beam_width");
         float matrix[3][4];
-        bool textured =
-            has_flag(emitter->flags(), mitsuba::EmitterFlags::SpatiallyVarying);
+        bool textured = has_flag(m_flags, mitsuba::EmitterFlags::SpatiallyVarying);
         if (!e.tabulated || textured || !cutoff_deg || !beam_deg ||
             !read_similarity(emitter->world_transform(), matrix))
             return add_other(emitter);
@@ -166,26 +184,21 @@ private:
         float cutoff = dr::deg_to_rad(read_scalar(*cutoff_deg)),
               beam   = dr::deg_to_rad(read_scalar(*beam_deg));
         LightRow row = make_row(LightKind::Spot, e);
-        float length = std::hypot(matrix[0][2], matrix[1][2], matrix[2][2]);
+        float length = norm(matrix[0][2], matrix[1][2], matrix[2][2]);
         for (int i = 0; i < 3; ++i) {
             row.geometry[i]     = matrix[i][3];
             row.geometry[3 + i] = matrix[i][2] / length;
         }
         row.geometry[6] = cutoff;
         // Without a transition (or an inverted one) the edge is hard
-        row.geometry[7] = cutoff > beam ? std::min(1.f / (cutoff - beam), 1e10f) : 1e10f;
+        row.geometry[7] =
+            cutoff > beam ? std::min(1.f / (cutoff - beam), kHardEdge) : kHardEdge;
 
         LightBounds bounds = point_bounds(row.geometry);
         // Uniform up to the middle of the transition
         float mean_cosine = .5f + .5f * std::cos(.5f * (std::min(beam, cutoff) + cutoff));
         for (int i = 0; i < 3; ++i)
             bounds.axis[i] = mean_cosine * row.geometry[3 + i];
-        // (1 - cos) as 2 sin^2, without cancellation
-        float sin_beam   = std::sin(.5f * std::min(beam, cutoff)),
-              sin_cutoff = std::sin(.5f * cutoff);
-        float flux       = 2 * dr::Pi<float> * e.luminance *
-                           (sin_beam * sin_beam + sin_cutoff * sin_cutoff);
-        bounds.flux      = flux;
         add_light(row, bounds);
     }
 
@@ -213,12 +226,11 @@ private:
     // ---------------------------------------------------------------- Area emitters
 
     void add_area(const Emitter *emitter, const Shape *shape) {
-        ParameterReader params(emitter);
-        Emission e     = EmissionReader<Float, Spectrum>::read(params, "radiance");
+        Emission e     = EmissionReader<Float, Spectrum>::read(emitter);
         uint32_t first = (uint32_t) m_table.light_of_primitive.size();
         bool known     = emitter->class_name() == "AreaLight";
         if (known && shape->is_mesh()) {
-            add_mesh(emitter, (const Mesh *) shape, e, params.object("radiance"));
+            add_mesh(emitter, (const Mesh *) shape, e);
         } else {
             std::string_view name = shape->class_name();
             uint32_t light        = (uint32_t) m_table.rows.size();
@@ -253,7 +265,7 @@ private:
     }
 
     static float column_length(const float m[3][4], int j) {
-        return std::hypot(m[0][j], m[1][j], m[2][j]);
+        return norm(m[0][j], m[1][j], m[2][j]);
     }
 
     static float determinant(const float m[3][4]) {
@@ -275,7 +287,6 @@ private:
         LightBounds bounds = point_bounds(row.geometry);
         grow(bounds, radius);
         bounds.variance = radius * radius / 3;
-        bounds.flux = 4 * dr::Pi<float> * radius * radius * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
     }
 
@@ -291,11 +302,10 @@ private:
             row.geometry[6 + i] = m[i][1 - u];
         }
         LightBounds bounds = point_bounds(row.geometry);
-        float area = set_axis(bounds, row.geometry + 3, row.geometry + 6) * dr::Pi<float>;
+        set_axis(bounds, row.geometry + 3, row.geometry + 6);
         float radius = std::max(column_length(m, 0), column_length(m, 1));
         grow(bounds, radius);
         bounds.variance = radius * radius / 6;
-        bounds.flux     = area * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
     }
 
@@ -319,41 +329,107 @@ private:
         }
         grow(bounds, radius);
         bounds.variance = (length * length / 12 + radius * radius) / 3;
-        bounds.flux = 2 * dr::Pi<float> * radius * length * dr::Pi<float> * e.luminance;
         add_light(row, bounds);
     }
 
     // ----------------------------------------------------------------------- Meshes
 
-    void add_mesh(const Emitter *emitter, const Mesh *mesh, const Emission &constant,
-                  const mitsuba::Object *texture) {
-        std::vector<float> vertices = download<float>(mesh->vertex_positions_buffer());
-        std::vector<uint32_t> faces = download<uint32_t>(mesh->faces_buffer());
-        size_t count                = faces.size() / 3;
-        std::vector<Emission> emission(count, constant);
+    void add_mesh(const Emitter *emitter, const Mesh *mesh, const Emission &constant) {
+        HostView vertices(mesh->vertex_positions_buffer());
+        HostView normals(mesh->vertex_normals_buffer());
+        HostView faces(mesh->faces_buffer());
+        std::vector<Emission> varying;
         if (!constant.tabulated)
-            emission = MeshEmission<Float, Spectrum>(emitter, mesh).read(texture);
-
-        std::vector<float> normals = download<float>(mesh->vertex_normals_buffer());
-        for (size_t f = 0; f < count; ++f) {
-            uint32_t light = (uint32_t) m_table.rows.size();
-            Side side      = emitting_side(vertices, normals, &faces[3 * f]);
-            if (mesh->has_flipped_normals() && side != Side::Both)
+            varying = MeshEmission<Float, Spectrum>(emitter, mesh).read();
+        bool flipped = mesh->has_flipped_normals();
+        add_triangles(faces.size() / 3, [&](size_t f, LightRow &row,
+                                            LightBounds &bounds) {
+            const uint32_t *face = &faces[3 * f];
+            Side side            = emitting_side(vertices.data(), normals.data(), face);
+            if (flipped && side != Side::Both)
                 side = side == Side::Front ? Side::Back : Side::Front;
-            add_triangle(vertices, &faces[3 * f], emission[f], (uint32_t) f, side);
-            push_primitive(light);
+            read_triangle(vertices.data(), face, varying.empty() ? constant : varying[f],
+                          (uint32_t) f, side, row, bounds);
+        });
+        if (!constant.tabulated)
+            m_table.proportional[m_emitter] = false;
+    }
+
+    /// What became of the triangles of one chunk
+    struct Part {
+        uint32_t kept = 0, invalid = 0;
+        bool by_plugin = false;
+    };
+
+    /// Add `count` lights, each read by `read(index, row, bounds)`, on all threads
+    template <typename F> void add_triangles(size_t count, const F &read) {
+        size_t first = m_table.rows.size(), primitive = m_table.light_of_primitive.size();
+        m_table.rows.resize(first + count);
+        m_table.bounds.resize(first + count);
+        m_table.light_of_primitive.resize(primitive + count);
+        std::vector<Part> parts(chunk_count(count));
+        for_chunks(count, [&](size_t chunk, size_t begin, size_t end) {
+            Part part;
+            for (size_t i = begin; i < end; ++i) {
+                size_t light        = first + begin + part.kept;
+                LightRow &row       = m_table.rows[light];
+                LightBounds &bounds = m_table.bounds[light];
+                read(i, row, bounds);
+                bounds.flux    = light_power(row);
+                float power    = usable_power(row, bounds);
+                bool kept      = is_valid(power) && power > 0,
+                     by_plugin = !(row.tag & kTagTabulated);
+                part.invalid += !is_valid(power);
+                part.by_plugin |= by_plugin;
+                m_table.light_of_primitive[primitive + i] =
+                    kept ? (uint32_t) light : (by_plugin ? kOnlyHit : kNone);
+                part.kept += kept;
+            }
+            parts[chunk] = part;
+        });
+        close_gaps(parts, first, primitive, count);
+        m_table.light_count += (uint32_t) count;
+        m_table.can_be_hit |= count > 0;
+        if (m_table.rows.size() > first)
+            m_table.kinds.insert(LightKind::Triangle);
+        m_table.proportional[m_emitter] = m_table.rows.size() == first + count;
+        for (const Part &part : parts) {
+            m_table.needs_emitter_eval |= part.by_plugin;
+            note_invalid(part.invalid);
         }
+    }
+
+    /// Move the lights of all chunks together
+    void close_gaps(const std::vector<Part> &parts, size_t first, size_t primitive,
+                    size_t count) {
+        size_t end = first;
+        for (size_t chunk = 0; chunk < parts.size(); ++chunk) {
+            size_t begin = first + chunk * kChunk, kept = parts[chunk].kept;
+            if (end < begin) {
+                std::copy_n(&m_table.rows[begin], kept, &m_table.rows[end]);
+                std::copy_n(&m_table.bounds[begin], kept, &m_table.bounds[end]);
+                for (size_t i = chunk * kChunk; i < std::min(count, (chunk + 1) * kChunk);
+                     ++i) {
+                    uint32_t &light = m_table.light_of_primitive[primitive + i];
+                    if (light < kOnlyHit)
+                        light -= (uint32_t) (begin - end);
+                }
+            }
+            end += kept;
+        }
+        m_table.rows.resize(end);
+        m_table.bounds.resize(end);
     }
 
     /// The side of a triangle, by its winding, on which it emits: that of the shading normal
     enum class Side { Front, Back, Both };
 
-    static Side emitting_side(const std::vector<float> &vertices,
-                              const std::vector<float> &normals, const uint32_t *face) {
-        if (normals.empty())
+    static Side emitting_side(const float *vertices, const float *normals,
+                              const uint32_t *face) {
+        if (!normals)
             return Side::Front;
-        auto corner = [&](const std::vector<float> &buffer, int i) {
-            const float *v = &buffer[3 * face[i]];
+        auto corner = [&](const float *buffer, int i) {
+            const float *v = buffer + 3 * (size_t) face[i];
             return mitsuba::Vector<float, 3>(v[0], v[1], v[2]);
         };
         auto v0 = corner(vertices, 0);
@@ -369,18 +445,17 @@ private:
         return low > flat ? Side::Front : (high < -flat ? Side::Back : Side::Both);
     }
 
-    void add_triangle(const std::vector<float> &vertices, const uint32_t *face,
-                      Emission e, uint32_t face_index, Side side) {
+    void read_triangle(const float *vertices, const uint32_t *face, Emission e,
+                       uint32_t face_index, Side side, LightRow &row,
+                       LightBounds &bounds) const {
         // With smooth normals only the emitter knows where it emits
         e.tabulated &= side != Side::Both;
         bool flip       = side == Side::Back;
-        LightRow row    = make_row(LightKind::Triangle, e);
-        const float *v0 = &vertices[3 * face[0]], *v1 = &vertices[3 * face[1]],
-                    *v2 = &vertices[3 * face[2]];
-        if (flip)
-            std::swap(v1, v2);
-        LightBounds bounds;
-        double square = 0;
+        row             = make_row(LightKind::Triangle, e);
+        const float *v0 = vertices + 3 * (size_t) face[0],
+                    *v1 = vertices + 3 * (size_t) face[flip ? 2 : 1],
+                    *v2 = vertices + 3 * (size_t) face[flip ? 1 : 2];
+        double square   = 0;
         for (int i = 0; i < 3; ++i) {
             row.geometry[i]     = v0[i];
             row.geometry[3 + i] = v1[i] - v0[i];
@@ -393,8 +468,7 @@ private:
                       (v2[i] - mean) * (v2[i] - mean);
         }
         bounds.variance = (float) (square / 36); // of a uniform point; trace / 3
-        float area      = .5f * set_axis(bounds, row.geometry + 3, row.geometry + 6);
-        bounds.flux     = area * dr::Pi<float> * e.luminance;
+        set_axis(bounds, row.geometry + 3, row.geometry + 6);
         if (side == Side::Both) {
             row.tag |= kTagTwoSided;
             std::fill_n(bounds.axis, 3, 0.f);
@@ -403,7 +477,6 @@ private:
             std::memcpy(&row.color[0], &face_index, sizeof(float));
             row.color[1] = flip ? 1.f : 0.f;
         }
-        add_light(row, bounds);
     }
 
     // --------------------------------------------------------------- Anything else
@@ -414,7 +487,7 @@ private:
         if (!can_sample(emitter))
             return add_only_hit();
         if (!find_bounds(emitter, low, high)) {
-            if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Surface))
+            if (has_flag(m_flags, mitsuba::EmitterFlags::Surface))
                 return add_only_hit();
             // Without a place it cannot be in the tree: always a candidate
             ++m_table.light_count;
@@ -423,8 +496,9 @@ private:
         }
         float power = emitted_power(emitter);
         bool known  = power > 0;
+        m_unknown_powers |= !known;
         Emission e;
-        e.luminance        = known ? power / (4 * dr::Pi<float>) : kUnknownPower;
+        e.luminance        = known ? power / (4 * kPi) : kUnknownPower;
         LightRow row       = make_row(LightKind::Other, e);
         LightBounds bounds = {};
         double square      = 0;
@@ -438,24 +512,27 @@ private:
         bounds.variance = (float) (square / 3);
         std::copy_n(bounds.mean, 3, row.geometry);
         row.geometry[3] = bounds.variance;
-        bounds.flux     = known ? power : kUnknownPower;
         add_light(row, bounds);
     }
 
     /// Give lights of unknown power the mean of the others, which is right in any unit
     void estimate_unknown_powers() {
+        if (!m_unknown_powers)
+            return;
         double sum   = 0;
         size_t known = 0;
-        for (const LightBounds &bounds : m_table.bounds) {
-            sum += bounds.flux;
-            known += bounds.flux != kUnknownPower;
+        for (size_t i = 0; i < m_table.rows.size(); ++i) {
+            sum += m_table.bounds[i].flux;
+            known += m_table.rows[i].luminance != kUnknownPower;
         }
         float mean = known ? (float) (sum / (double) known) : 1.f;
-        for (size_t i = 0; i < m_table.bounds.size(); ++i)
-            if (m_table.bounds[i].flux == kUnknownPower) {
+        for (size_t i = 0; i < m_table.rows.size(); ++i)
+            if (m_table.rows[i].luminance == kUnknownPower) {
                 m_table.bounds[i].flux    = mean;
-                m_table.rows[i].luminance = mean / (4 * dr::Pi<float>);
+                m_table.rows[i].luminance = mean / (4 * kPi);
             }
+        // It depends on all the others
+        m_table.proportional.assign(m_table.proportional.size(), false);
     }
 
     /// Some shapes (ellipsoidsmesh) do not tell their emitter about themselves
@@ -488,12 +565,12 @@ private:
         }
     }
 
-    static bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
-                            ScalarPoint3f &high) {
+    bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
+                     ScalarPoint3f &high) const {
         auto box   = emitter->bbox();
         low        = box.min;
         high       = box.max;
-        bool delta = has_flag(emitter->flags(), mitsuba::EmitterFlags::DeltaPosition);
+        bool delta = has_flag(m_flags, mitsuba::EmitterFlags::DeltaPosition);
         if (!box.valid() && delta) { // projectors have no box, only a transformation
             auto position = emitter->world_transform().translation();
             for (int i = 0; i < 3; ++i)
@@ -544,7 +621,7 @@ private:
     }
 
     LightRow make_row(LightKind kind, const Emission &e) const {
-        LightRow row;
+        LightRow row{};
         std::copy_n(e.color, 3, row.color);
         row.luminance = e.luminance;
         row.scale     = e.scale;
@@ -567,38 +644,44 @@ private:
         }
     }
 
-    /// Set the emission axis to the direction of u x v; returns its length
-    static float set_axis(LightBounds &bounds, const float u[3], const float v[3]) {
-        float n[3]   = { u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
-                         u[0] * v[1] - u[1] * v[0] };
-        float length = std::hypot(n[0], n[1], n[2]);
+    /// Set the emission axis to the direction of u x v
+    static void set_axis(LightBounds &bounds, const float u[3], const float v[3]) {
+        float n[3];
+        cross(u, v, n);
+        float length                = norm(n);
         constexpr float mean_cosine = 2.f / 3.f;
         for (int i = 0; i < 3; ++i)
             bounds.axis[i] = length > 0 ? mean_cosine * n[i] / length : 0;
-        return length;
     }
 
-    /// Lights without power, and degenerate ones, stay out
-    void add_light(const LightRow &row, const LightBounds &bounds) {
-        ++m_table.light_count;
+    /// Power that decides whether a light can be chosen; infinite without a finite place
+    static float usable_power(const LightRow &row, const LightBounds &bounds) {
         bool finite = std::isfinite(bounds.flux) && std::isfinite(bounds.variance);
         for (int i = 0; i < 3; ++i)
             finite &=
                 std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
-        bool hit_able  = has_flag(m_scene->emitters()[m_emitter]->flags(),
-                                  mitsuba::EmitterFlags::Surface);
+        // The flux of a spot does not show the sign
+        return finite ? std::min(bounds.flux, row.luminance) : dr::Infinity<float>;
+    }
+
+    /// Lights without power, and degenerate ones, stay out
+    void add_light(const LightRow &row, LightBounds bounds) {
+        ++m_table.light_count;
+        LightKind kind = (LightKind) (row.tag & kTagKindMask);
+        bool hit_able  = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
         m_table.can_be_hit |= hit_able;
-        // The flux of a spot does not show the sign
-        float power = finite ? std::min(bounds.flux, row.luminance) : dr::Infinity<float>;
-        check(power);
-        if (!finite || !(power > 0)) {
+        bounds.flux = light_power(row);
+        float power = usable_power(row, bounds);
+        note_invalid(!is_valid(power));
+        if (!is_valid(power) || power == 0) {
             m_only_hit = by_plugin; // black as far as the quadrature saw
             return;
         }
-        m_table.beams |= (row.tag & kTagKindMask) == (uint32_t) LightKind::Spot &&
-                         row.geometry[6] < kWidestBeam;
+        m_table.proportional[m_emitter] = kind != LightKind::Other;
+        m_table.beams |= kind == LightKind::Spot && row.geometry[6] < kWidestBeam;
+        m_table.kinds.insert(kind);
         m_table.rows.push_back(row);
         m_table.bounds.push_back(bounds);
     }
@@ -611,7 +694,11 @@ private:
     /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
     bool m_only_hit    = false;
-    /// Lights that \ref check noted, and the index of the first one's emitter
+    /// Flags of that emitter: asking for them makes a variable in JIT variants
+    uint32_t m_flags = 0;
+    /// Is there a light with \ref kUnknownPower?
+    bool m_unknown_powers = false;
+    /// Lights that \ref note_invalid noted, and the index of the first one's emitter
     uint32_t m_invalid = 0, m_first_invalid = 0;
 
     static constexpr const char *ClassName = "LightTable"; // for log messages

@@ -20,9 +20,10 @@ public:
     MeshEmission(const Emitter *emitter, const Mesh *mesh)
         : m_emitter(emitter), m_mesh(mesh) {}
 
-    /// Mean emission of each face, from the texture that is the emitter's radiance
-    std::vector<Emission> read(const mitsuba::Object *texture) const {
+    /// Mean emission of each face
+    std::vector<Emission> read() const {
         std::vector<Emission> result(m_mesh->face_count());
+        const mitsuba::Object *texture = ParameterReader(m_emitter).object("radiance");
         if (texture && texture->class_name() == "MeshAttribute")
             read_attribute(result);
         else
@@ -46,9 +47,9 @@ private:
                 dr::load<Float>(b1.data(), count), dr::load<Float>(b2.data(), count));
             for (int c = 0; c < 3; ++c) {
                 color.entry(c) += dr::zeros<Float>(count);
-                std::vector<float> host = download<float>(dr::detach(color.entry(c)));
+                HostView host(color.entry(c));
                 for (size_t i = 0; i < count; ++i)
-                    result[i][c] = host[i];
+                    result[i][c] = (float) host[i];
             }
         } else {
             for (size_t i = 0; i < count; ++i) {
@@ -123,7 +124,7 @@ private:
     }
 
     /// Sub-triangles along each edge of a face: about two for each texel along it
-    uint32_t subdivisions(const std::vector<float> &uv, const uint32_t *face,
+    uint32_t subdivisions(const float *uv, const uint32_t *face,
                           ScalarVector2i resolution) const {
         if (!m_mesh->has_vertex_texcoords())
             return 2;
@@ -139,8 +140,8 @@ private:
     /// Centroids of n^2 equal sub-triangles of each face, evaluated in batches
     void integrate_texture(const mitsuba::Object *texture,
                            std::vector<Emission> &result) const {
-        std::vector<uint32_t> indices = download<uint32_t>(m_mesh->faces_buffer());
-        std::vector<float> uv = download<float>(m_mesh->vertex_texcoords_buffer());
+        HostView indices(m_mesh->faces_buffer());
+        HostView uv(m_mesh->vertex_texcoords_buffer());
         ScalarVector2i resolution(64, 64); // of procedural textures
         if (auto *t = dynamic_cast<const Texture *>(texture); t && has_resolution(t))
             resolution = t->resolution();
@@ -160,7 +161,7 @@ private:
             b2.clear();
         };
         for (uint32_t f = 0; f < result.size(); ++f) {
-            uint32_t n = subdivisions(uv, &indices[3 * f], resolution);
+            uint32_t n = subdivisions(uv.data(), &indices[3 * f], resolution);
             for (uint32_t i = 0; i < n; ++i)
                 for (uint32_t j = 0; i + j < n; ++j)
                     for (uint32_t upper = 0; upper < 2 && i + j + upper < n; ++upper) {

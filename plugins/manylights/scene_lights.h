@@ -6,120 +6,66 @@
  */
 
 #include "emission.h"
+#include "fingerprint.h"
 #include "light_table.h"
 #include "media.h"
+#include <atomic>
 #include <chrono>
-#include <drjit/tensor.h>
 #include <mitsuba/render/bsdf.h>
 #include <unordered_map>
 
 namespace manylights {
 
-/// Collects the identity (JIT) or the values (scalar) of an object's parameters
-template <typename Float> class Fingerprint {
+/// Memory on the host that is filled or changed there and becomes an array for kernels
+template <typename Storage> class HostStorage {
 public:
-    using Object = mitsuba::Object;
+    using Value = dr::scalar_t<Storage>;
 
-    void add(const Object *object) {
-        mix((uint64_t) object);
-        if constexpr (dr::is_jit_v<Float>) {
-            // A changed parameter is a new variable. Holding on to them keeps the indices
-            // from being used again.
-            dr::scoped_set_flag guard(JitFlag::EnableObjectTraversal, true);
-            object->traverse_1_cb_ro(
-                this, [](void *self, uint64_t index, const char *, const char *) {
-                    ((Fingerprint *) self)->hold(index);
-                });
+    /// Memory for `size` numbers, not initialized
+    Value *allocate(size_t size) {
+        if constexpr (dr::is_cuda_v<Storage>) {
+            m_copy.resize(size);
+            return m_copy.data();
         } else {
-            ValueHash callback(*this);
-            const_cast<Object *>(object)->traverse(&callback);
+            m_array = dr::empty<Storage>(size);
+            return host_data();
         }
     }
 
-    bool operator==(const Fingerprint &other) const {
-        return m_hash == other.m_hash && m_held.size() == other.m_held.size();
+    /// The numbers of an array, which is taken away. They are copied if kernels that have
+    /// not run yet need the array as it is
+    Value *open(Storage &array) {
+        if constexpr (dr::is_cuda_v<Storage>) {
+            HostView view(array);
+            m_copy.assign(view.data(), view.data() + view.size());
+            return m_copy.data();
+        } else {
+            m_array = std::move(array);
+            if constexpr (dr::is_jit_v<Storage>)
+                if (jit_var_ref(m_array.index()) > 1)
+                    m_array = dr::load<Storage>(HostView(m_array).data(), m_array.size());
+            return host_data();
+        }
     }
 
-    Fingerprint()               = default;
-    Fingerprint(Fingerprint &&) = default;
-    Fingerprint &operator=(Fingerprint &&other) {
-        std::swap(m_held, other.m_held);
-        std::swap(m_hash, other.m_hash);
-        return *this;
-    }
-    ~Fingerprint() {
-        for (uint32_t index : m_held)
-            jit_var_dec_ref(index);
-    }
-
-    void mix(uint64_t value) { // FNV-1a over 64-bit words
-        m_hash = (m_hash ^ value) * 0x100000001b3ull;
-        m_hash ^= m_hash >> 29;
+    Storage close() {
+        if constexpr (dr::is_cuda_v<Storage>)
+            return dr::load<Storage>(m_copy.data(), m_copy.size());
+        else
+            return std::move(m_array);
     }
 
 private:
-    /// The upper half tells whether the variable has a gradient
-    void hold(uint64_t combined) {
-        mix(combined);
-        if (uint32_t index = (uint32_t) combined) {
-            jit_var_inc_ref(index);
-            m_held.push_back(index);
-        }
+    Value *host_data() {
+        Value *data = m_array.data();
+        // Kernels that run may still use this memory
+        if constexpr (dr::is_jit_v<Storage>)
+            dr::sync_thread();
+        return data;
     }
 
-    void mix_bytes(const void *data, size_t size) {
-        mix(size);
-        for (size_t i = 0; i < size; i += sizeof(uint64_t)) {
-            uint64_t word = 0;
-            std::memcpy(&word, (const char *) data + i, std::min(sizeof(word), size - i));
-            mix(word);
-        }
-    }
-
-    /// Mix a value if it is one of the types
-    template <typename... Ts>
-    void mix_plain(const void *value, const std::type_info &type) {
-        ((type == typeid(Ts) ? mix_bytes(value, sizeof(Ts)) : void()), ...);
-    }
-
-    /// Mix a buffer or a tensor if its entries are of one of the types
-    template <typename... Ts> void mix_buffer(void *value, const std::type_info &type) {
-        auto mix_array = [&](auto *array) {
-            using Value = dr::scalar_t<std::decay_t<decltype(*array)>>;
-            mix_bytes(array->data(), array->size() * sizeof(Value));
-        };
-        ((type == typeid(dr::DynamicArray<Ts>) ? mix_array((dr::DynamicArray<Ts> *) value)
-                                               : void()),
-         ...);
-        ((type == typeid(dr::Tensor<dr::DynamicArray<Ts>>)
-              ? mix_array((dr::Tensor<dr::DynamicArray<Ts>> *) value)
-              : void()),
-         ...);
-    }
-
-    struct ValueHash : mitsuba::TraversalCallback {
-        Fingerprint &out;
-        explicit ValueHash(Fingerprint &out) : out(out) {}
-
-        void put_value(std::string_view, void *value, uint32_t,
-                       const std::type_info &type) override {
-            using Core = mitsuba::CoreAliases<float>;
-            out.template mix_plain<bool, float, double, int32_t, uint32_t,
-                                   mitsuba::Color<float, 1>, mitsuba::Color<float, 3>,
-                                   mitsuba::Point<float, 2>, mitsuba::Point<float, 3>,
-                                   mitsuba::Vector<float, 2>, mitsuba::Vector<float, 3>,
-                                   typename Core::AffineTransform4f>(value, type);
-            out.template mix_buffer<float, uint32_t, dr::half>(value, type);
-        }
-
-        void put_object(std::string_view, Object *object, uint32_t) override {
-            if (object)
-                object->traverse(this);
-        }
-    };
-
-    std::vector<uint32_t> m_held;
-    uint64_t m_hash = 0xcbf29ce484222325ull;
+    Storage m_array;
+    HostVector<Value> m_copy;
 };
 
 template <typename Float, typename Spectrum> class SceneLights : public mitsuba::Object {
@@ -135,65 +81,107 @@ public:
         uint32_t lights = 0, lights_in_tree = 0, nodes = 0, depth = 0;
         double bytes   = 0;
         float build_ms = 0;
+        /// Time of the last refit since then, 0 if there was none
+        float refit_ms = 0;
     };
 
     SceneLights(const Scene *scene, bool keep_binary) {
-        auto start                 = std::chrono::steady_clock::now();
-        auto table                 = LightTableReader<Float, Spectrum>::read(scene);
-        LightTree tree             = build_tree(table.bounds, keep_binary);
-        std::vector<LightRow> rows = ordered_rows(table, tree);
-
-        m_infinite = std::move(table.infinite);
+        Stopwatch stopwatch;
+        Table table = LightTableReader<Float, Spectrum>::read(scene);
+        m_infinite  = std::move(table.infinite);
         if (!m_infinite.empty())
             m_infinite_dr = dr::load<mitsuba::DynamicBuffer<EmitterPtr>>(
                 m_infinite.data(), m_infinite.size());
+        m_proportional       = std::move(table.proportional);
         m_needs_emitter_eval = table.needs_emitter_eval;
         m_can_be_hit         = table.can_be_hit;
-        for (const LightRow &row : rows)
-            m_tree.kinds.insert((LightKind) (row.tag & kTagKindMask));
-        m_tree.directions  = directions(table);
-        m_glossy           = any_glossy(scene);
-        m_media            = Media<Float, Spectrum>::find(scene);
-        m_tree.light_count = (uint32_t) rows.size();
-        m_tree.nodes =
-            upload((const float *) tree.wide.data(), tree.wide.size() * kWideNodeFloats);
-        m_tree.node_links = upload_indices(tree.node_link);
-        m_tree.binary     = upload((const float *) tree.binary.data(),
-                                   tree.binary.size() * kBinaryNodeFloats);
-        m_tree.rows       = upload((const float *) rows.data(), rows.size() * kRowFloats);
-        upload_map(table, tree);
+        m_tree.kinds         = table.kinds;
+        m_tree.directions    = directions(table);
+        m_glossy             = any_glossy(scene);
+        m_media              = Media<Float, Spectrum>::find(scene);
+        m_tree.light_count   = (uint32_t) table.rows.size();
+
+        HostStorage<Storage> nodes;
+        auto node_memory = [&](size_t count) {
+            return (WideNode *) nodes.allocate(count * kWideNodeFloats);
+        };
+        LightTree tree = build_tree(std::move(table.bounds), node_memory, keep_binary);
+        m_tree.nodes   = or_empty(nodes.close());
+        // Never empty either
+        tree.node_link.push_back(kNone);
+        m_tree.node_links =
+            dr::load<IndexStorage>(tree.node_link.data(), tree.node_link.size());
+        m_tree.binary = or_empty(dr::load<Storage>(
+            tree.binary.data(), tree.binary.size() * kBinaryNodeFloats));
+        make_rows(table, tree);
+        make_map(table, tree);
         if constexpr (dr::is_jit_v<Float>)
             dr::eval(m_tree.nodes, m_tree.node_links, m_tree.binary, m_tree.rows,
                      m_shape_lights, m_light_of_primitive);
 
         m_statistics.lights         = table.light_count;
         m_statistics.lights_in_tree = m_tree.light_count;
-        m_statistics.nodes          = (uint32_t) tree.wide.size();
+        m_statistics.nodes          = tree.wide_count;
         m_statistics.depth          = tree.depth;
         m_statistics.bytes =
             sizeof(float) *
             ((double) dr::width(m_tree.nodes) + dr::width(m_tree.node_links) +
              dr::width(m_tree.binary) + dr::width(m_tree.rows) +
              dr::width(m_light_of_primitive) + dr::width(m_shape_lights));
-        m_statistics.build_ms = std::chrono::duration<float, std::milli>(
-                                    std::chrono::steady_clock::now() - start)
-                                    .count();
+        m_statistics.build_ms = stopwatch.milliseconds();
+    }
+
+    /**
+     * Follow a change of what some emitters emit, without a new tree: colours, fluxes and
+     * moments. False if that is not possible; the lights are then of no use any more.
+     *
+     * Lights with power stay where they are; those that had none are missing. Binary nodes
+     * are not kept up to date.
+     */
+    bool refit(const Scene *scene, const std::vector<uint32_t> &changed) {
+        Stopwatch stopwatch;
+        std::vector<Emission> emission;
+        std::vector<uint32_t> index(m_proportional.size(), kNone); // into `emission`
+        for (uint32_t i : changed) {
+            const Emitter *emitter = scene->emitters()[i].get();
+            Emission e             = EmissionReader<Float, Spectrum>::read(emitter);
+            if (!m_proportional[i] || !e.tabulated || !(e.luminance > 0) ||
+                !std::isfinite(e.luminance))
+                return false;
+            if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite))
+                continue;
+            index[i] = (uint32_t) emission.size();
+            emission.push_back(e);
+        }
+        if (!emission.empty() && !refit(emission, index))
+            return false;
+        m_statistics.refit_ms = stopwatch.milliseconds();
+        return true;
     }
 
     static Fingerprint<Float> fingerprint(const Scene *scene) {
-        Fingerprint<Float> result;
+        Fingerprint<Float> result(scene->emitters().size());
+        dr::mask_t<Float> active(true);
         for (const auto &emitter : scene->emitters()) {
-            result.add(emitter.get());
-            result.mix(emitter->flags());
-            if (const Shape *shape = emitter->shape()) {
+            const Shape *shape = emitter->shape();
+            result.add_emitter(emitter.get());
+            uint32_t flags = emitter->flags(active);
+            result.mix(flags);
+            if (shape) {
                 result.add(shape);
                 result.mix(shape->has_flipped_normals());
             }
+            // Kernels know them by number: another object may have got the address
+            if constexpr (dr::is_jit_v<Float>)
+                if (shape || has_flag(flags, mitsuba::EmitterFlags::Infinite))
+                    result.mix(jit_registry_id(shape ? (const void *) shape
+                                                     : (const void *) emitter.get()));
         }
         // The same emitters may belong to another scene: a new one that lies in memory
         // where a deleted one lay
         MediaKinds media = Media<Float, Spectrum>::find(scene);
-        result.mix(4 * any_glossy(scene) + 2 * media.homogeneous + media.heterogeneous);
+        result.mix_common(4 * any_glossy(scene) + 2 * media.homogeneous +
+                          media.heterogeneous);
         return result;
     }
 
@@ -241,8 +229,8 @@ public:
     MI_DECLARE_CLASS(SceneLights)
 
 private:
-    using Table        = HostTable<Float, Spectrum>;
-    using Storage      = typename Tree::Storage;
+    using Table   = HostTable<Float, Spectrum>;
+    using Storage = typename Tree::Storage;
     using IndexStorage = typename Tree::IndexStorage;
 
     static Directions directions(const Table &table) {
@@ -262,34 +250,92 @@ private:
         return false;
     }
 
-    static std::vector<LightRow> ordered_rows(const Table &table, const LightTree &tree) {
-        std::vector<LightRow> rows(table.rows.size());
-        for (size_t i = 0; i < rows.size(); ++i) {
-            rows[i]      = table.rows[tree.order[i]];
-            rows[i].link = tree.link[i];
+    class Stopwatch {
+    public:
+        float milliseconds() const {
+            auto time = std::chrono::steady_clock::now() - m_start;
+            return std::chrono::duration<float, std::milli>(time).count();
         }
-        return rows;
+
+    private:
+        std::chrono::steady_clock::time_point m_start = std::chrono::steady_clock::now();
+    };
+
+    /// Never empty: kernels may refer to it with all lanes inactive
+    static Storage or_empty(const Storage &array) {
+        return dr::width(array) ? array : dr::zeros<Storage>(kWideNodeFloats);
     }
 
-    static Storage upload(const float *data, size_t size) {
-        // Never empty: kernels may refer to it with all lanes inactive
-        return size ? dr::load<Storage>(data, size) : dr::zeros<Storage>(kWideNodeFloats);
+    /// The table's rows in the order of the tree
+    void make_rows(Table &table, const LightTree &tree) {
+        HostStorage<Storage> storage;
+        size_t count = table.rows.size();
+        if (count > 0) {
+            LightRow *rows = (LightRow *) storage.allocate(count * kRowFloats);
+            for_chunks(count, [&](size_t, size_t begin, size_t end) {
+                for (size_t i = begin; i < end; ++i) {
+                    rows[i]      = table.rows[tree.order[i]];
+                    rows[i].link = tree.link[i];
+                }
+            });
+        }
+        m_tree.rows = or_empty(storage.close());
+        HostVector<LightRow>().swap(table.rows);
     }
 
-    static IndexStorage upload_indices(const std::vector<uint32_t> &data) {
-        return data.empty() ? dr::zeros<IndexStorage>(1)
-                            : dr::load<IndexStorage>(data.data(), data.size());
+    bool refit(const std::vector<Emission> &emission,
+               const std::vector<uint32_t> &index) {
+        HostStorage<Storage> row_storage, node_storage;
+        HostVector<float> fluxes(m_tree.light_count);
+        LightRow *rows  = (LightRow *) row_storage.open(m_tree.rows);
+        WideNode *nodes = (WideNode *) node_storage.open(m_tree.nodes);
+        bool beams      = m_tree.directions == Directions::Beams;
+        std::atomic<bool> valid{ true };
+        for_chunks(m_tree.light_count, [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i) {
+                LightRow &row = rows[i];
+                uint32_t e    = index[row.tag >> kTagEmitterShift];
+                if (e != kNone)
+                    set_emission(row, emission[e]);
+                float flux = light_flux(row, beams);
+                if (!(flux > 0) || !std::isfinite(flux))
+                    valid = false;
+                fluxes[i] = flux;
+            }
+        });
+        if (!valid)
+            return false;
+        refit_tree(nodes, m_statistics.nodes, fluxes);
+        m_tree.rows  = row_storage.close();
+        m_tree.nodes = node_storage.close();
+        return true;
     }
 
-    void upload_map(const Table &table, const LightTree &tree) {
-        std::vector<uint32_t> position(table.rows.size());
-        for (size_t i = 0; i < position.size(); ++i)
-            position[tree.order[i]] = (uint32_t) i;
-        std::vector<uint32_t> lights(table.light_of_primitive);
-        for (uint32_t &light : lights)
-            light = light >= kOnlyHit ? light : position[light];
-        lights.push_back(kNone);
-        m_light_of_primitive = dr::load<IndexStorage>(lights.data(), lights.size());
+    static void set_emission(LightRow &row, const Emission &e) {
+        row.luminance = e.luminance;
+        if (!(row.tag & kTagTabulated))
+            return;
+        std::copy_n(e.color, 3, row.color);
+        row.scale = e.scale;
+    }
+
+    void make_map(const Table &table, const LightTree &tree) {
+        HostVector<uint32_t> position(tree.order.size());
+        for_chunks(position.size(), [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i)
+                position[tree.order[i]] = (uint32_t) i;
+        });
+        HostStorage<IndexStorage> storage;
+        size_t count     = table.light_of_primitive.size();
+        uint32_t *lights = storage.allocate(count + 1);
+        for_chunks(count, [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i) {
+                uint32_t light = table.light_of_primitive[i];
+                lights[i]      = light >= kOnlyHit ? light : position[light];
+            }
+        });
+        lights[count]        = kNone;
+        m_light_of_primitive = storage.close();
 
         if constexpr (dr::is_jit_v<Float>) {
             std::vector<uint32_t> ranges(2, 0);
@@ -311,6 +357,8 @@ private:
     Tree m_tree;
     IndexStorage m_light_of_primitive, m_shape_lights;
     std::unordered_map<const Shape *, ShapeLights<Shape>> m_shape_map;
+    /// See HostTable; for each emitter of the scene
+    std::vector<bool> m_proportional;
     std::vector<const Emitter *> m_infinite;
     mitsuba::DynamicBuffer<EmitterPtr> m_infinite_dr;
     bool m_needs_emitter_eval = false, m_can_be_hit = false, m_glossy = false;

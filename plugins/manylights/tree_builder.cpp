@@ -6,7 +6,6 @@
 #include <cmath>
 #include <drjit/packet.h>
 #include <limits>
-#include <nanothread/nanothread.h>
 
 namespace manylights {
 
@@ -27,22 +26,16 @@ constexpr uint32_t kTaskLights = 1 << 14;
 /// Threads differ in what they do with denormals: the result must not
 float to_float(double x) { return std::abs(x) < (double) FLT_MIN ? 0.f : (float) x; }
 
+/// Flux as a fraction of the sum. A positive weight is a promise that a light can be chosen
+float flux_share(float flux, double sum) {
+    return std::max((float) (flux / sum), FLT_MIN);
+}
+
 /// Factor of the flux while it is summed up: far from the denormals
 constexpr float kFluxScale = 0x1p60f;
 
-/// A light while it is sorted: one cache line
-struct alignas(64) Item {
-    /// Box, with flux and variance in the fourth lanes
-    Float4 low, high;
-    /// Mean position, and the bits of the light's index
-    Float4 mean;
-    /// Scaled flux times axis, and scaled flux
-    Float4 weight;
-
-    float flux() const { return low[3]; }
-    float variance() const { return high[3]; }
-    uint32_t light() const { return dr::reinterpret_array<uint32_t>(mean[3]); }
-};
+/// Four numbers of a light at once; the fourth lane is whatever lies there
+Float4 four(const float *numbers) { return dr::load_aligned<Float4>(numbers); }
 
 /// flux * M_A * M_Omega, the cost of a cluster (see the header for both measures)
 template <typename Box>
@@ -56,15 +49,20 @@ double cluster_cost(const Box &low, const Box &high, double flux, double axis_le
 
 /// All that the cost of a set of lights depends on
 struct Bin {
-    Float4 low    = std::numeric_limits<float>::infinity();
-    Float4 high   = -std::numeric_limits<float>::infinity();
-    Float4 weight = 0.f;
+    Float4 low, high, weight;
 
-    template <typename Other> void add(const Other &other) {
-        low  = dr::minimum(low, other.low);
-        high = dr::maximum(high, other.high);
-        weight += other.weight;
+    void clear() {
+        low    = std::numeric_limits<float>::infinity();
+        high   = -std::numeric_limits<float>::infinity();
+        weight = 0.f;
     }
+    void add(const Float4 &other_low, const Float4 &other_high,
+             const Float4 &other_weight) {
+        low  = dr::minimum(low, other_low);
+        high = dr::maximum(high, other_high);
+        weight += other_weight;
+    }
+    void add(const Bin &other) { add(other.low, other.high, other.weight); }
     bool empty() const { return !(weight[3] > 0); }
     double cost() const {
         if (empty())
@@ -79,10 +77,11 @@ struct Centroids {
     Float4 low  = std::numeric_limits<float>::infinity();
     Float4 high = -std::numeric_limits<float>::infinity();
 
-    void add(const Item &item) {
-        low  = dr::minimum(low, item.mean);
-        high = dr::maximum(high, item.mean);
+    void add(const Float4 &other_low, const Float4 &other_high) {
+        low  = dr::minimum(low, other_low);
+        high = dr::maximum(high, other_high);
     }
+    void add(const LightBounds &light) { add(four(light.mean), four(light.mean)); }
 };
 
 /// Everything that a cluster contributes to the node above it
@@ -128,90 +127,103 @@ struct Subtree {
     }
 };
 
-/// Interior node of the binary tree
+/// Interior node of the binary tree: what decides how it is collapsed
 struct Node {
-    Cluster cluster;
+    float cost, flux;
     /// First light of the right child
     uint32_t middle;
+    /// Wide nodes of this subtree, if one begins here
+    uint32_t wide_count;
 };
 
 class Builder {
 public:
-    explicit Builder(const std::vector<LightBounds> &lights) : m_items(lights.size()) {
-        double flux = 0;
-        for (uint32_t i = 0; i < (uint32_t) lights.size(); ++i) {
-            m_items[i] = make_item(lights[i], i);
-            m_centroids.add(m_items[i]);
-            flux += lights[i].flux;
+    explicit Builder(HostVector<LightBounds> &&lights) : m_lights(std::move(lights)) {
+        size_t chunks = chunk_count(m_lights.size());
+        std::vector<double> flux(chunks, 0.0);
+        std::vector<Centroids> centroids(chunks);
+        for_chunks(m_lights.size(), [&](size_t chunk, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i) {
+                m_lights[i].light = (uint32_t) i;
+                centroids[chunk].add(m_lights[i]);
+                flux[chunk] += m_lights[i].flux;
+            }
+        });
+        double sum = 0;
+        for (size_t i = 0; i < chunks; ++i) {
+            sum += flux[i];
+            m_centroids.add(centroids[i].low, centroids[i].high);
         }
-        for (size_t i = 0; i < lights.size(); ++i) {
-            Item &item = m_items[i];
-            // A positive weight is a promise that the light can be chosen
-            item.low[3]  = std::max((float) (lights[i].flux / flux), FLT_MIN);
-            item.high[3] = lights[i].variance;
-            item.weight =
-                Float4(lights[i].axis[0], lights[i].axis[1], lights[i].axis[2], 1.f) *
-                (item.low[3] * kFluxScale);
-        }
-        m_nodes.resize(lights.empty() ? 0 : lights.size() - 1);
+        for_chunks(m_lights.size(), [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i)
+                normalize(m_lights[i], sum);
+        });
+        m_nodes.resize(m_lights.empty() ? 0 : m_lights.size() - 1);
     }
 
-    LightTree build(bool keep_binary) {
+    LightTree build(const NodeMemory &memory, bool keep_binary) {
         LightTree tree;
-        uint32_t count = (uint32_t) m_items.size();
+        uint32_t count = (uint32_t) m_lights.size();
         if (count == 0)
             return tree;
         Subtree root{ 0, count, 0 };
         split(root, m_centroids, 0);
-        tree.order.resize(count);
-        for (uint32_t i = 0; i < count; ++i)
-            tree.order[i] = m_items[i].light();
-        tree.link.assign(count, kNone);
-        tree.wide.reserve(count / 2 + 1);
-        collapse(tree, root, kNone, 1);
+
+        Extent extent   = measure(root);
+        tree.wide_count = extent.count;
+        tree.depth      = extent.depth;
+        tree.link.resize(count);
+        tree.node_link.resize(tree.wide_count);
+        m_wide      = memory(tree.wide_count);
+        m_link      = tree.link.data();
+        m_node_link = tree.node_link.data();
+        collapse(root, 0, kNone);
         if (keep_binary) {
             tree.binary.reserve(2 * (size_t) count - 1);
             write_binary(tree.binary, root);
         }
+
+        tree.order.resize(count);
+        for_chunks(count, [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i)
+                tree.order[i] = m_lights[i].light;
+        });
+        refit_tree(m_wide, tree.wide_count, take_flux());
         return tree;
     }
 
 private:
-    static Item make_item(const LightBounds &light, uint32_t index) {
-        auto three = [](const float *v, float w) { return Float4(v[0], v[1], v[2], w); };
-        return { three(light.box_min, 0.f), three(light.box_max, 0.f),
-                 three(light.mean, dr::reinterpret_array<float>(index)), Float4(0.f) };
+    /// Weight the axis with the flux as a fraction of the sum
+    static void normalize(LightBounds &light, double sum) {
+        light.weight = flux_share(light.flux, sum) * kFluxScale;
+        for (float &coordinate : light.axis)
+            coordinate *= light.weight;
     }
 
-    static Cluster leaf_cluster(const Item &item) {
+    static Cluster leaf_cluster(const LightBounds &light) {
         Cluster c;
         for (int i = 0; i < 3; ++i) {
-            c.box_min[i] = item.low[i];
-            c.box_max[i] = item.high[i];
-            c.mean[i]    = item.mean[i];
-            c.axis[i]    = item.weight[i] / item.weight[3];
+            c.box_min[i] = light.box_min[i];
+            c.box_max[i] = light.box_max[i];
+            c.mean[i]    = light.mean[i];
+            c.axis[i]    = light.axis[i] / light.weight;
         }
-        c.variance = item.variance();
-        c.flux     = item.flux();
+        c.variance = light.variance;
+        c.flux     = light.weight / kFluxScale;
         c.cost     = 0;
         return c;
     }
 
-    Cluster cluster(const Subtree &tree) const {
-        return tree.is_leaf() ? leaf_cluster(m_items[tree.begin])
-                              : m_nodes[tree.node].cluster;
-    }
-
     // ---------------------------------------------------------------------- Binary tree
 
-    /// Sort the lights of a subtree and fill its nodes
-    void split(const Subtree &tree, const Centroids &centroids, uint32_t depth) {
+    /// Sort the lights of a subtree and fill its nodes; returns its cluster
+    Cluster split(const Subtree &tree, const Centroids &centroids, uint32_t depth) {
         if (tree.is_leaf())
-            return;
+            return leaf_cluster(m_lights[tree.begin]);
         Centroids left_centroids, right_centroids;
         uint32_t middle = tree.begin;
         if (tree.count() == 2)
-            sort_pair(m_items[tree.begin], m_items[tree.begin + 1]);
+            sort_pair(m_lights[tree.begin], m_lights[tree.begin + 1]);
         else if (depth < kMaxCostDepth)
             middle = partition(tree, centroids, left_centroids, right_centroids);
         if (middle == tree.begin || middle == tree.end) {
@@ -220,21 +232,23 @@ private:
         }
 
         Subtree left = tree.left(middle), right = tree.right(middle);
-        auto split_left = [&] { split(left, left_centroids, depth + 1); };
+        Cluster left_cluster, right_cluster;
+        auto split_left = [&] { left_cluster = split(left, left_centroids, depth + 1); };
         // Both halves write to places of their own: the result does not depend on threads
-        if (left.count() > kTaskLights && right.count() > kTaskLights) {
-            Task *task = drjit::do_async(split_left);
-            split(right, right_centroids, depth + 1);
-            task_wait_and_release(task);
-        } else {
+        Tasks tasks;
+        if (left.count() > kTaskLights && right.count() > kTaskLights)
+            tasks.start(split_left);
+        else
             split_left();
-            split(right, right_centroids, depth + 1);
-        }
-        m_nodes[tree.node] = { join(cluster(left), cluster(right)), middle };
+        right_cluster = split(right, right_centroids, depth + 1);
+        tasks.wait();
+        Cluster c          = join(left_cluster, right_cluster);
+        m_nodes[tree.node] = { c.cost, c.flux, middle, 0 };
+        return c;
     }
 
     /// Two lights lie in the order of their coordinates, whatever the input's order was
-    static void sort_pair(Item &a, Item &b) {
+    static void sort_pair(LightBounds &a, LightBounds &b) {
         for (int axis = 0; axis < 3; ++axis) {
             if (a.mean[axis] != b.mean[axis]) {
                 if (a.mean[axis] > b.mean[axis])
@@ -265,8 +279,14 @@ private:
                 if (extent[i] > 1e-6f * longest && extent[i] > 1e-30f)
                     scale[i] = (float) bins / extent[i];
         }
-        Int4 bin(const Item &item) const {
-            return dr::minimum(Int4((item.mean - low) * scale), (int32_t) bins - 1);
+        Int4 bin(const LightBounds &light) const {
+            return dr::minimum(Int4((four(light.mean) - low) * scale),
+                               (int32_t) bins - 1);
+        }
+        /// Is its bin on the axis of the plane one of those on its left?
+        bool is_left(const LightBounds &light, const Plane &plane) const {
+            int axis = plane.axis;
+            return (light.mean[axis] - low[axis]) * scale[axis] < (float) plane.bin;
         }
     };
 
@@ -279,13 +299,13 @@ private:
             return tree.begin;
         uint32_t left = tree.begin, right = tree.end;
         while (left < right) {
-            Item &item = m_items[left];
-            if (grid.bin(item)[plane.axis] < plane.bin) {
-                left_centroids.add(item);
+            LightBounds &light = m_lights[left];
+            if (grid.is_left(light, plane)) {
+                left_centroids.add(light);
                 ++left;
             } else {
-                right_centroids.add(item);
-                std::swap(item, m_items[--right]);
+                right_centroids.add(light);
+                std::swap(light, m_lights[--right]);
             }
         }
         return left;
@@ -293,10 +313,16 @@ private:
 
     Plane cheapest_plane(const Subtree &tree, const Grid &grid) const {
         Bin bins[3][kBins];
+        for (int axis = 0; axis < 3; ++axis)
+            for (uint32_t i = 0; i < grid.bins; ++i)
+                bins[axis][i].clear();
         for (uint32_t i = tree.begin; i < tree.end; ++i) {
-            Int4 bin = grid.bin(m_items[i]);
+            const LightBounds &light = m_lights[i];
+            Int4 bin                 = grid.bin(light);
+            Float4 low = four(light.box_min), high = four(light.box_max),
+                   weight = four(light.axis);
             for (int axis = 0; axis < 3; ++axis)
-                bins[axis][bin[axis]].add(m_items[i]);
+                bins[axis][bin[axis]].add(low, high, weight);
         }
 
         float widest = dr::max(grid.scale);
@@ -318,16 +344,21 @@ private:
                       Plane &best) {
         std::array<double, kBins> right_cost;
         Bin side;
+        side.clear();
+        double cost = 0;
         for (uint32_t i = count - 1; i > 0; --i) {
-            side.add(bins[i]);
-            right_cost[i] = side.cost();
+            if (!bins[i].empty()) {
+                side.add(bins[i]);
+                cost = side.cost();
+            }
+            right_cost[i] = cost;
         }
-        side = Bin();
+        side.clear();
         for (uint32_t i = 1; i < count; ++i) {
             if (bins[i - 1].empty())
                 continue;
             side.add(bins[i - 1]);
-            double cost = factor * (side.cost() + right_cost[i]);
+            cost = factor * (side.cost() + right_cost[i]);
             if (cost < best.cost)
                 best = { axis, (int32_t) i, cost };
         }
@@ -335,34 +366,70 @@ private:
 
     // ------------------------------------------------------------------------ Wide tree
 
-    /// Write the wide node of a subtree; returns its index
-    uint32_t collapse(LightTree &tree, const Subtree &root, uint32_t link,
-                      uint32_t depth) const {
+    /// Size of a wide tree
+    struct Extent {
+        uint32_t count, depth;
+    };
+
+    /// Call f(slot) for the interior ones of the children of a wide node
+    template <typename F>
+    static void for_interior(const std::array<Subtree, 4> &children, uint32_t count,
+                             const F &f) {
+        Tasks tasks;
+        for (uint32_t slot = 0; slot < count; ++slot) {
+            if (children[slot].count() > kTaskLights)
+                tasks.start([&f, slot] { f(slot); });
+            else if (!children[slot].is_leaf())
+                f(slot);
+        }
+    }
+
+    /// Note how many wide nodes there are in each subtree at which one begins
+    Extent measure(const Subtree &root) {
+        std::array<Subtree, 4> children{ root };
+        uint32_t count  = open_children(children);
+        Extent below[4] = {}, sum{ 1, 0 };
+        for_interior(children, count,
+                     [&](uint32_t slot) { below[slot] = measure(children[slot]); });
+        for (const Extent &extent : below) {
+            sum.count += extent.count;
+            sum.depth = std::max(sum.depth, extent.depth);
+        }
+        ++sum.depth;
+        if (!root.is_leaf())
+            m_nodes[root.node].wide_count = sum.count;
+        return sum;
+    }
+
+    /// Write the wide nodes of a subtree, parents first, with the moments of leaves alone
+    void collapse(const Subtree &root, uint32_t index, uint32_t link) const {
         std::array<Subtree, 4> children{ root };
         uint32_t count = open_children(children);
-
-        uint32_t index = (uint32_t) tree.wide.size();
-        tree.wide.emplace_back();
-        tree.node_link.push_back(link);
-        WideNode node;
-        double flux = 0;
-        for (uint32_t slot = 0; slot < count; ++slot)
-            flux += cluster(children[slot]).flux;
-        tree.depth = std::max(tree.depth, depth);
+        WideNode node{};
+        m_node_link[index] = link;
+        uint32_t next      = index + 1;
         for (uint32_t slot = 0; slot < count; ++slot) {
             const Subtree &child = children[slot];
-            write_child(node, slot, cluster(child), flux);
             if (child.is_leaf()) {
-                node.child[slot]       = kLeafBit | child.begin;
-                tree.link[child.begin] = 4 * index + slot;
+                write_leaf(node, slot, m_lights[child.begin]);
+                node.child[slot]    = kLeafBit | child.begin;
+                m_link[child.begin] = 4 * index + slot;
             } else {
-                node.child[slot] = collapse(tree, child, 4 * index + slot, depth + 1);
+                node.child[slot] = next;
+                next += m_nodes[child.node].wide_count;
             }
         }
-        for (uint32_t slot = count; slot < 4; ++slot)
-            write_empty(node, slot);
-        tree.wide[index] = node;
-        return index;
+        m_wide[index] = node;
+        for_interior(children, count, [&](uint32_t slot) {
+            collapse(children[slot], node.child[slot], 4 * index + slot);
+        });
+    }
+
+    static void write_leaf(WideNode &node, uint32_t slot, const LightBounds &light) {
+        for (int i = 0; i < 3; ++i)
+            node.mean[i][slot] = light.mean[i];
+        node.moments[slot] = pack_moments(0.f, light.variance);
+        node.axis[slot]    = pack_axis(leaf_cluster(light).axis);
     }
 
     /// Replace the costliest interior entry by its two children until there are four
@@ -390,71 +457,181 @@ private:
 
     /// By cost; coincident lights cost nothing and are opened by flux
     bool costlier(const Subtree &a, const Subtree &b) const {
-        const Cluster &x = m_nodes[a.node].cluster, &y = m_nodes[b.node].cluster;
+        const Node &x = m_nodes[a.node], &y = m_nodes[b.node];
         return x.cost != y.cost ? x.cost > y.cost : x.flux > y.flux;
     }
 
-    static void write_child(WideNode &node, uint32_t slot, const Cluster &cluster,
-                            double node_flux) {
-        for (int i = 0; i < 3; ++i)
-            node.mean[i][slot] = cluster.mean[i];
-        node.moments[slot] =
-            pack_moments((float) (cluster.flux / node_flux), cluster.variance);
-        node.axis[slot] = pack_axis(cluster.axis);
-    }
-
-    /// As far away as another child, and without flux
-    static void write_empty(WideNode &node, uint32_t slot) {
-        for (int i = 0; i < 3; ++i)
-            node.mean[i][slot] = node.mean[i][0];
-        node.moments[slot] = node.moments[0] & 0xffffu;
-        node.child[slot]   = node.child[0];
-        node.axis[slot]    = node.axis[0];
-    }
-
-    /// Append the nodes of a subtree, leaves included
-    void write_binary(std::vector<BinaryNode> &nodes, const Subtree &tree) const {
-        Cluster c = cluster(tree);
-        BinaryNode node{};
-        std::copy_n(c.box_min, 3, node.box_min);
-        std::copy_n(c.box_max, 3, node.box_max);
-        std::copy_n(c.mean, 3, node.mean);
-        node.variance  = c.variance;
-        node.flux      = c.flux;
-        node.axis      = pack_axis(c.axis);
-        node.first     = tree.begin;
-        node.right     = kNone;
-        node.light     = tree.is_leaf() ? tree.begin : kNone;
+    /// Append the nodes of a subtree, leaves included; returns its cluster
+    Cluster write_binary(std::vector<BinaryNode> &nodes, const Subtree &tree) const {
         uint32_t index = (uint32_t) nodes.size(),
-                 most  = 2 * (uint32_t) m_items.size() - 1;
-        node.escape    = index + 2 * tree.count() - 1;
+                 most  = 2 * (uint32_t) m_lights.size() - 1;
+        nodes.emplace_back();
+        BinaryNode node{};
+        node.first  = tree.begin;
+        node.right  = kNone;
+        node.light  = tree.is_leaf() ? tree.begin : kNone;
+        node.escape = index + 2 * tree.count() - 1;
         if (node.escape == most)
             node.escape = kNone;
-        if (!tree.is_leaf()) {
+        Cluster c;
+        if (tree.is_leaf()) {
+            c = leaf_cluster(m_lights[tree.begin]);
+        } else {
             uint32_t middle = m_nodes[tree.node].middle;
             Subtree left    = tree.left(middle);
             node.right      = index + 2 * left.count();
-            nodes.push_back(node);
-            write_binary(nodes, left);
-            write_binary(nodes, tree.right(middle));
-        } else {
-            nodes.push_back(node);
+            c               = write_binary(nodes, left);
+            c               = join(c, write_binary(nodes, tree.right(middle)));
         }
+        std::copy_n(c.box_min, 3, node.box_min);
+        std::copy_n(c.box_max, 3, node.box_max);
+        std::copy_n(c.mean, 3, node.mean);
+        node.variance = c.variance;
+        node.flux     = c.flux;
+        node.axis     = pack_axis(c.axis);
+        nodes[index]  = node;
+        return c;
     }
 
-    std::vector<Item> m_items;
-    std::vector<Node> m_nodes;
+    /// Fluxes in the order of the leaves; the rest of the lights is given back
+    HostVector<float> take_flux() {
+        HostVector<float> flux(m_lights.size());
+        for_chunks(flux.size(), [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i)
+                flux[i] = m_lights[i].flux;
+        });
+        HostVector<LightBounds>().swap(m_lights);
+        HostVector<Node>().swap(m_nodes);
+        return flux;
+    }
+
+    HostVector<LightBounds> m_lights;
+    HostVector<Node> m_nodes;
     Centroids m_centroids;
+    /// Where the wide nodes, the lights' links and the nodes' links are written to
+    WideNode *m_wide = nullptr;
+    uint32_t *m_link = nullptr, *m_node_link = nullptr;
+};
+
+// ------------------------------------------------------------------------------- Refit
+
+float unpack_coordinate(uint32_t packed, int coordinate) {
+    return (float) ((int32_t) (packed << (22 - 10 * coordinate)) >> 22) * (1.f / 511.f);
+}
+
+float unpack_variance(uint32_t moments) {
+    return dr::reinterpret_array<float>(moments << 16);
+}
+
+/// What a wide node is to its parent
+struct Moments {
+    double flux;
+    float mean[3], variance, axis[3];
+};
+
+class Refit {
+public:
+    Refit(WideNode *nodes, size_t count, const HostVector<float> &flux)
+        : m_nodes(nodes), m_flux(flux), m_moments(count) {}
+
+    /// All nodes of a subtree, children first
+    void run(size_t begin, size_t end) {
+        if (end - begin <= kTaskLights) {
+            for (size_t i = end; i-- > begin;)
+                m_moments[i] = fill(m_nodes[i]);
+            return;
+        }
+        {
+            Tasks tasks;
+            size_t after = end;
+            for (int slot = 3; slot >= 0; --slot) {
+                uint32_t child = m_nodes[begin].child[slot];
+                if (child == 0 || child & kLeafBit)
+                    continue;
+                tasks.start([=] { run(child, after); });
+                after = child;
+            }
+        }
+        m_moments[begin] = fill(m_nodes[begin]);
+    }
+
+private:
+    /// The child in a slot; an empty one has no flux
+    Moments child(const WideNode &node, int slot) const {
+        uint32_t child = node.child[slot];
+        if (child != 0 && !(child & kLeafBit))
+            return m_moments[child];
+        Moments leaf;
+        leaf.flux = child == 0 ? 0 : (double) m_flux[child & ~kLeafBit];
+        for (int i = 0; i < 3; ++i) {
+            leaf.mean[i] = node.mean[i][slot];
+            leaf.axis[i] = unpack_coordinate(node.axis[slot], i);
+        }
+        leaf.variance = unpack_variance(node.moments[slot]);
+        return leaf;
+    }
+
+    /// Write the slots of a node whose children are done
+    Moments fill(WideNode &node) const {
+        Moments children[4];
+        double flux = 0, mean[3] = {}, axis[3] = {}, variance = 0;
+        for (int slot = 0; slot < 4; ++slot) {
+            const Moments &c = children[slot] = child(node, slot);
+            flux += c.flux;
+            for (int i = 0; i < 3; ++i) {
+                mean[i] += c.flux * c.mean[i];
+                axis[i] += c.flux * c.axis[i];
+            }
+        }
+        for (double &coordinate : mean)
+            coordinate /= flux;
+        for (int slot = 0; slot < 4; ++slot) {
+            const Moments &c = children[slot];
+            double distance2 = 0;
+            for (int i = 0; i < 3; ++i)
+                distance2 += (c.mean[i] - mean[i]) * (c.mean[i] - mean[i]);
+            variance += c.flux * (c.variance + distance2 * (1.0 / 3));
+            // An empty slot is as far away as another one
+            write(node, slot, node.child[slot] == 0 ? children[0] : c, c.flux / flux);
+        }
+        Moments result;
+        result.flux     = flux;
+        result.variance = to_float(variance / flux);
+        for (int i = 0; i < 3; ++i) {
+            result.mean[i] = to_float(mean[i]);
+            result.axis[i] = (float) (axis[i] / flux);
+        }
+        return result;
+    }
+
+    static void write(WideNode &node, int slot, const Moments &child, double share) {
+        for (int i = 0; i < 3; ++i)
+            node.mean[i][slot] = child.mean[i];
+        node.moments[slot] = pack_moments((float) share, child.variance);
+        node.axis[slot]    = pack_axis(child.axis);
+    }
+
+    WideNode *m_nodes;
+    const HostVector<float> &m_flux;
+    HostVector<Moments> m_moments;
 };
 
 } // namespace
 
-LightTree build_tree(const std::vector<LightBounds> &lights, bool keep_binary) {
-    return Builder(lights).build(keep_binary);
+LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
+                     bool keep_binary) {
+    LightTree tree;
+    run_with_denormals(
+        [&] { tree = Builder(std::move(lights)).build(memory, keep_binary); });
+    return tree;
+}
+
+void refit_tree(WideNode *nodes, size_t count, const HostVector<float> &flux) {
+    run_with_denormals([&] { Refit(nodes, count, flux).run(0, count); });
 }
 
 uint32_t pack_moments(float flux, float variance) {
-    auto upper = [](float x) { // no overflow: up to the largest such number
+    auto upper = [](float x) { // does not round up to infinity
         uint32_t bits = dr::reinterpret_array<uint32_t>(std::min(x, 0x1.fep127f));
         return (bits + 0x8000u) >> 16;
     };
@@ -464,8 +641,10 @@ uint32_t pack_moments(float flux, float variance) {
 uint32_t pack_axis(const float axis[3]) {
     uint32_t result = 0;
     for (int i = 0; i < 3; ++i) {
-        float clamped = std::clamp(axis[i], -1.f, 1.f);
-        result |= ((uint32_t) std::lround(clamped * 511.f) & 1023u) << (10 * i);
+        float scaled = std::clamp(axis[i], -1.f, 1.f) * 511.f;
+        // std::lround, which is a call
+        int32_t rounded = (int32_t) (scaled + std::copysign(.5f, scaled));
+        result |= ((uint32_t) rounded & 1023u) << (10 * i);
     }
     return result;
 }

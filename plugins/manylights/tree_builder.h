@@ -14,26 +14,30 @@
  *   over the lights, so that bins are merged without trigonometry.
  *
  * Where the cost cannot decide (coincident lights) and below a depth of 64, the range
- * is halved, so the depth is bounded. The same input gives the same tree, bit for bit.
+ * is halved, so the depth is bounded. The same input gives the same tree, bit for bit,
+ * with any number of threads.
  *
  * Plain C++: compiled once for all variants.
  */
 
+#include "host_memory.h"
 #include "light.h"
+#include <functional>
 
 namespace manylights {
 
 /**
  * A node of the default tree: the moments of its four children, as a structure of
- * arrays so that one packet gather brings the same quantity of all four.
+ * arrays so that one packet gather brings the same quantity of all four. Children are
+ * stored behind their parents.
  */
 struct WideNode {
     /// Flux-weighted mean position of each child
     float mean[3][4];
-    /// Flux as a fraction of the node's, 0 marks an empty slot, and flux-weighted variance of
-    /// the position (trace / 3), the lights' extents included; see \ref pack_moments
+    /// Flux as a fraction of the node's, 0 in an empty slot, and flux-weighted variance of the
+    /// position (trace / 3), the lights' extents included: see \ref pack_moments
     uint32_t moments[4];
-    /// Index of the child node, or kLeafBit | light
+    /// Index of the child node, or kLeafBit | light, or 0 in an empty slot
     uint32_t child[4];
     /// Flux-weighted mean emission axis, see \ref pack_axis
     uint32_t axis[4];
@@ -62,25 +66,38 @@ struct BinaryNode {
 constexpr size_t kBinaryNodeFloats = 16;
 static_assert(sizeof(BinaryNode) == kBinaryNodeFloats * sizeof(float));
 
-/// The tree and the order of the lights that it implies
+/// The tree, and the order of the lights that it implies
 struct LightTree {
-    std::vector<WideNode> wide;
+    /// Nodes of the wide tree, in the caller's memory
+    uint32_t wide_count = 0;
     /// node_link[i] = 4 * parent + slot at which wide node i hangs, kNone for the root
-    std::vector<uint32_t> node_link;
+    HostVector<uint32_t> node_link;
     std::vector<BinaryNode> binary;
     /// order[i] is the input index of light i: leaves are numbered in tree order
-    std::vector<uint32_t> order;
+    HostVector<uint32_t> order;
     /// link[i] = 4 * node + slot at which light i hangs in the wide tree
-    std::vector<uint32_t> link;
+    HostVector<uint32_t> link;
     /// Levels of the wide tree, 0 without lights
     uint32_t depth = 0;
 };
 
+/// Returns memory for that many nodes
+using NodeMemory = std::function<WideNode *(size_t)>;
+
 /**
  * Build the tree over `lights`, all of which must have finite bounds and a positive,
- * finite flux. `keep_binary` also keeps the binary nodes (method `talk`).
+ * finite flux; their memory is used up. The wide nodes go to where `memory` says, which
+ * is called if there are any. `keep_binary` also keeps the binary nodes (method `talk`).
  */
-LightTree build_tree(const std::vector<LightBounds> &lights, bool keep_binary);
+LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
+                     bool keep_binary);
+
+/**
+ * Fill a tree from the bottom up, after building it or after a change of fluxes: leaves keep
+ * their mean, variance and axis, all other slots get the moments of the nodes below them.
+ * `flux` has an entry for each light, positive, in any unit.
+ */
+void refit_tree(WideNode *nodes, size_t count, const HostVector<float> &flux);
 
 /// Upper halves of two floats, rounded to nearest: flux (never rounded to 0) and variance
 uint32_t pack_moments(float flux, float variance);
