@@ -88,13 +88,13 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
 
 3. on each of these a point is sampled and :math:`F`, the product of BSDF, emission,
    geometry and MIS weight, is evaluated without visibility. :math:`s`
-   (:code:`shadow_rays`) of them are chosen with a probability proportional to the luminance
-   of :math:`C F`, and only these are traced:
+   (:code:`shadow_rays`) of them are chosen with a probability proportional to the
+   brightness :math:`|C F|`, the root mean square of its channels, and only these are traced:
 
 .. math::
 
     L_o(x) \approx \sum_{i=1}^{s} V_i\, C_i\, F_i\, \max\left(1, \frac{\tau}{g_i}\right),
-    \qquad g_i = \mathrm{lum}(C_i F_i),
+    \qquad g_i = |C_i F_i|,
 
 where :math:`\tau` is the step of the systematic sampling that chose them. The estimate is
 unbiased, whatever :math:`h` and :math:`H`. With at most :math:`m` lights there is no tree:

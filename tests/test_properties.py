@@ -30,6 +30,10 @@ pytestmark = pytest.mark.usefixtures("plugin")
 
 EPSILON = float(np.finfo(np.float32).eps)
 SMALLEST = float(np.finfo(np.float32).tiny)
+
+STORED = 2.0**-8
+"""Relative rounding of variances and shares of the flux in the wide nodes."""
+
 NONE, LEAF = 0xFFFFFFFF, 0x80000000
 
 
@@ -169,31 +173,32 @@ BINARY = np.dtype(
 
 
 def check_wide_nodes(lights):
-    """Slots hold all lights once, in order; links lead back up; the flux of children adds up."""
+    """Slots hold all lights once, in order; links lead back up; shares of the flux sum to one."""
     tree = lights.tree()
-    nodes = np.frombuffer(tree.nodes, WIDE)
-    assert len(nodes) == tree.node_count
+    nodes, links = np.frombuffer(tree.nodes, WIDE), tree.node_links
+    flux = (nodes["moments"] & 0xFFFF0000).view("f4")
+    variance = (nodes["moments"] << 16).view("f4")
+    assert len(nodes) == len(links) == tree.node_count
     leaves = []
 
-    def visit(index, link, flux):
-        node = nodes[index]
-        assert node["link"] == link
-        used = node["flux"] > 0
+    def visit(index, link):
+        node, shares = nodes[index], flux[index]
+        assert links[index] == link
+        used = shares > 0
         assert used.sum() >= min(2, len(lights.flux)) and not used[used.sum() :].any()
-        # Single precision rounds each flux once: half a unit for the children, half for the node
-        total = node["flux"].astype(float).sum()
-        assert abs(total - flux) <= EPSILON * flux + 4 * SMALLEST
+        # Eight digits of each share of the flux are stored
+        assert abs(shares.astype(float).sum() - 1) <= STORED + 4 * SMALLEST
         for slot in np.flatnonzero(used):
             child = int(node["child"][slot])
             if child & LEAF:
                 leaves.append(child & ~LEAF)
             else:
-                visit(child, 4 * index + slot, float(node["flux"][slot]))
+                visit(child, 4 * index + slot)
 
-    visit(0, NONE, 1.0)
+    visit(0, NONE)
     assert leaves == list(range(len(lights.flux)))
     assert sorted(tree.order) == leaves
-    assert all(np.isfinite(nodes[name]).all() for name in ("mean", "variance", "flux"))
+    assert all(np.isfinite(numbers).all() for numbers in (nodes["mean"], flux, variance))
 
 
 def check_binary_nodes(lights):
@@ -397,7 +402,7 @@ def check_coincident_lights(look):
     tree = lights.tree(shuffle)
     w = np.array(tree.probabilities(**look.receiver()), float)
     share = lights.flux.astype(float)[shuffle] / lights.flux.sum(dtype=float)
-    assert np.abs(w / share - 1)[share > 1e-12].max() <= rounding(tree)
+    assert np.abs(w / share - 1)[share > 1e-12].max() <= tree.depth * STORED
 
 
 generic_lights = lights_of(st.integers(2, 200), st.just(0))

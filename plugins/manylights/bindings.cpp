@@ -144,6 +144,9 @@ public:
     nb::bytes nodes() const {
         return nb::bytes(m_wide.data(), m_wide.size() * sizeof(WideNode));
     }
+    std::vector<uint32_t> node_links() const {
+        return { m_tree.node_link.begin(), m_tree.node_link.end() };
+    }
     nb::bytes binary_nodes() const {
         return nb::bytes(m_tree.binary.data(), m_tree.binary.size() * sizeof(BinaryNode));
     }
@@ -278,6 +281,8 @@ NB_MODULE(_core, m) {
         .def_prop_ro("node_count", &Tree::node_count, "Nodes of the 4-wide tree.")
         .def_prop_ro("order", &Tree::order, "Input index of each leaf, in tree order.")
         .def_prop_ro("nodes", &Tree::nodes, "The 4-wide nodes as bytes.")
+        .def_prop_ro("node_links", &Tree::node_links,
+                     "4 * parent + slot of each 4-wide node.")
         .def_prop_ro("binary_nodes", &Tree::binary_nodes, "The binary nodes as bytes.");
     m.def("select", &select_items, "targets"_a, "picks"_a, "offset"_a,
           "Threshold-systematic selection: chosen items, and weights max(1, tau / "

@@ -8,7 +8,7 @@
  *   more than m candidates, all are kept with C = 1 / p and nothing is resampled.
  * Stage 3: a point on each kept light, F = BSDF * emission * geometry * MIS weight without
  *   visibility; s of them are chosen by threshold-systematic sampling with target
- *   luminance(C F) and traced. (The talk draws s reservoirs; here the items of large
+ *   |C F| and traced. (The talk draws s reservoirs; here the items of large
  *   target are taken for sure, the rest at equidistant points: half the variance at s = 4.)
  *
  * Lights at infinity never enter the tree: they join stage 3 with C = 1.
@@ -495,7 +495,7 @@ private:
         return sample.value * m_media.transmittance(ray, medium, rng, active) & active;
     }
 
-    /// luminance(F) of a light's point
+    /// |F| of a light's point
     FloatD light_target(const Vertex &vertex, const UInt32D &light,
                         const FloatD &inclusion, const UInt32D &slot, Mask active) const {
         Sample sample = sample_light_point(vertex, light, inclusion, slot,
@@ -631,7 +631,7 @@ private:
             Mask eval = active && !row.tabulated();
             if (target_only)
                 dr::masked(emission, eval) = mitsuba::depolarizer<Spectrum>(
-                    UnpolarizedSpectrum(Float(row[kLuminance])));
+                    UnpolarizedSpectrum(Float(row[kBrightness])));
             else
                 m_emission.add_masked(emission, eval, [&](Mask m) {
                     return m_emission.triangle_emission(from, row, point, d, m);

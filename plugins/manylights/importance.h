@@ -386,7 +386,7 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
         reflectance =
             lobe(at, Float(dr::dot(at.n, a.w) * inv_d),
                  Float(dr::dot(at.wi, a.w) * inv_d), Float(a.variance * inv_d * inv_d));
-    return row[kLuminance] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d *
+    return row[kBrightness] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d *
            inv_d * reflectance;
 }
 

@@ -53,8 +53,8 @@ constexpr uint32_t kOnlyHit = 0xfffffffeu;
 struct LightRow {
     float geometry[9];
     float color[3];
-    /// Luminance of the mean radiance or intensity; for `Other`: flux / (4 pi)
-    float luminance;
+    /// Brightness of the mean radiance or intensity; for `Other`: flux / (4 pi)
+    float brightness;
     /// See above; 1 in RGB and monochrome variants
     float scale;
     /// kind, flag and emitter index: see \ref make_tag
@@ -68,11 +68,11 @@ static_assert(sizeof(LightRow) == kRowFloats * sizeof(float));
 
 /// Offsets of the fields of a row, in floats
 enum RowField : size_t {
-    kColor     = 9,
-    kLuminance = 12,
-    kScale     = 13,
-    kTag       = 14,
-    kLink      = 15
+    kColor      = 9,
+    kBrightness = 12,
+    kScale      = 13,
+    kTag        = 14,
+    kLink       = 15
 };
 
 constexpr uint32_t kTagKindMask     = 7;

@@ -52,17 +52,17 @@ inline float spot_power(float cutoff, float inverse_transition) {
 inline float light_power(const LightRow &row) {
     LightKind kind = (LightKind) (row.tag & kTagKindMask);
     if (kind == LightKind::Point || kind == LightKind::Other)
-        return 4 * kPi * row.luminance;
+        return 4 * kPi * row.brightness;
     if (kind == LightKind::Spot)
-        return spot_power(row.geometry[6], row.geometry[7]) * row.luminance;
-    return light_area(row, kind) * kPi * row.luminance;
+        return spot_power(row.geometry[6], row.geometry[7]) * row.brightness;
+    return light_area(row, kind) * kPi * row.brightness;
 }
 
 /// Weight in the tree (see LightBounds); `beams`: are there narrow spots in the scene?
 inline float light_flux(const LightRow &row, bool beams) {
     float power = light_power(row);
     if (!beams && (row.tag & kTagKindMask) == (uint32_t) LightKind::Spot)
-        return std::sqrt(power * 4 * kPi * row.luminance);
+        return std::sqrt(power * 4 * kPi * row.brightness);
     return power;
 }
 

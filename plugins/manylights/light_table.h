@@ -129,8 +129,8 @@ private:
             ++m_table.light_count;
             m_table.infinite.push_back(emitter);
             Emission e = EmissionReader<Float, Spectrum>::read(emitter);
-            note_invalid(!is_valid(e.luminance));
-            m_table.proportional[index] = e.tabulated && e.luminance > 0;
+            note_invalid(!is_valid(e.brightness));
+            m_table.proportional[index] = e.tabulated && e.brightness > 0;
         } else
             add_other(emitter);
     }
@@ -498,7 +498,7 @@ private:
         bool known  = power > 0;
         m_unknown_powers |= !known;
         Emission e;
-        e.luminance        = known ? power / (4 * kPi) : kUnknownPower;
+        e.brightness       = known ? power / (4 * kPi) : kUnknownPower;
         LightRow row       = make_row(LightKind::Other, e);
         LightBounds bounds = {};
         double square      = 0;
@@ -523,13 +523,13 @@ private:
         size_t known = 0;
         for (size_t i = 0; i < m_table.rows.size(); ++i) {
             sum += m_table.bounds[i].flux;
-            known += m_table.rows[i].luminance != kUnknownPower;
+            known += m_table.rows[i].brightness != kUnknownPower;
         }
         float mean = known ? (float) (sum / (double) known) : 1.f;
         for (size_t i = 0; i < m_table.rows.size(); ++i)
-            if (m_table.rows[i].luminance == kUnknownPower) {
-                m_table.bounds[i].flux    = mean;
-                m_table.rows[i].luminance = mean / (4 * kPi);
+            if (m_table.rows[i].brightness == kUnknownPower) {
+                m_table.bounds[i].flux     = mean;
+                m_table.rows[i].brightness = mean / (4 * kPi);
             }
         // It depends on all the others
         m_table.proportional.assign(m_table.proportional.size(), false);
@@ -623,9 +623,9 @@ private:
     LightRow make_row(LightKind kind, const Emission &e) const {
         LightRow row{};
         std::copy_n(e.color, 3, row.color);
-        row.luminance = e.luminance;
-        row.scale     = e.scale;
-        row.tag       = make_tag(kind, e.tabulated, m_emitter);
+        row.brightness = e.brightness;
+        row.scale      = e.scale;
+        row.tag        = make_tag(kind, e.tabulated, m_emitter);
         return row;
     }
 
@@ -661,7 +661,7 @@ private:
             finite &=
                 std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
         // The flux of a spot does not show the sign
-        return finite ? std::min(bounds.flux, row.luminance) : dr::Infinity<float>;
+        return finite ? std::min(bounds.flux, row.brightness) : dr::Infinity<float>;
     }
 
     /// Lights without power, and degenerate ones, stay out

@@ -117,7 +117,7 @@ private:
                 e.color[c] =
                     constant ? corner[0][i][c]
                              : (corner[0][i][c] + corner[1][i][c] + corner[2][i][c]) / 3;
-            e.luminance = Reader::luminance(e.color);
+            e.brightness = Reader::brightness(e.color);
             // A spectrum cannot be recovered from its mean
             e.tabulated = constant && !mitsuba::is_spectral_v<Spectrum>;
         }
@@ -153,7 +153,7 @@ private:
         auto flush = [&] {
             std::vector<Color3> colors = evaluate(faces, b1, b2);
             for (size_t i = 0; i < faces.size(); ++i) {
-                sum[faces[i]] += Reader::luminance(colors[i].data());
+                sum[faces[i]] += Reader::brightness(colors[i].data());
                 points[faces[i]] += 1;
             }
             faces.clear();
@@ -174,7 +174,7 @@ private:
         }
         flush();
         for (size_t f = 0; f < result.size(); ++f)
-            result[f].luminance = (float) (sum[f] / points[f]);
+            result[f].brightness = (float) (sum[f] / points[f]);
     }
 
     static bool has_resolution(const Texture *texture) {

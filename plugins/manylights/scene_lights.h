@@ -145,8 +145,8 @@ public:
         for (uint32_t i : changed) {
             const Emitter *emitter = scene->emitters()[i].get();
             Emission e             = EmissionReader<Float, Spectrum>::read(emitter);
-            if (!m_proportional[i] || !e.tabulated || !(e.luminance > 0) ||
-                !std::isfinite(e.luminance))
+            if (!m_proportional[i] || !e.tabulated || !(e.brightness > 0) ||
+                !std::isfinite(e.brightness))
                 return false;
             if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite))
                 continue;
@@ -229,8 +229,8 @@ public:
     MI_DECLARE_CLASS(SceneLights)
 
 private:
-    using Table   = HostTable<Float, Spectrum>;
-    using Storage = typename Tree::Storage;
+    using Table        = HostTable<Float, Spectrum>;
+    using Storage      = typename Tree::Storage;
     using IndexStorage = typename Tree::IndexStorage;
 
     static Directions directions(const Table &table) {
@@ -312,7 +312,7 @@ private:
     }
 
     static void set_emission(LightRow &row, const Emission &e) {
-        row.luminance = e.luminance;
+        row.brightness = e.brightness;
         if (!(row.tag & kTagTabulated))
             return;
         std::copy_n(e.color, 3, row.color);
