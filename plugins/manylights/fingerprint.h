@@ -7,7 +7,7 @@
  */
 
 #include "emission_reader.h"
-#include "host_memory.h"
+#include <algorithm>
 #include <cstring>
 #include <drjit/tensor.h>
 #include <mitsuba/core/object.h>
@@ -32,27 +32,10 @@ public:
     void mix_bytes(const void *data, size_t size) {
         mix(size);
         const char *bytes = (const char *) data;
-        if (size < kPiece)
-            return mix_piece(bytes, size);
-        std::vector<Hash> pieces(chunk_count(size, kPiece));
-        for_chunks(
-            size,
-            [&](size_t i, size_t begin, size_t end) {
-                pieces[i].mix_piece(bytes + begin, end - begin);
-            },
-            kPiece);
-        for (const Hash &piece : pieces)
-            mix(piece.value);
-    }
-
-private:
-    /// Bytes of a large buffer that are hashed as one
-    static constexpr size_t kPiece = 1 << 18;
-
-    void mix_piece(const char *bytes, size_t size) {
-        // Four chains at once: each has to wait for its multiplications
-        size_t i = 0;
+        size_t i          = 0;
         if (size >= 64) {
+            // Four chains at once: each has to wait for its multiplications. Not on several
+            // threads: those that look for more work afterwards would slow the render down
             Hash lanes[4];
             for (int k = 0; k < 4; ++k)
                 lanes[k].value += k;
@@ -66,6 +49,7 @@ private:
             mix(word(bytes + i, std::min<size_t>(8, size - i)));
     }
 
+private:
     static uint64_t word(const char *bytes, size_t size) {
         uint64_t result = 0;
         std::memcpy(&result, bytes, size);

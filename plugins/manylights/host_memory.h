@@ -67,16 +67,14 @@ private:
 /// of threads
 constexpr size_t kChunk = 1 << 14;
 
-inline size_t chunk_count(size_t size, size_t chunk = kChunk) {
-    return (size + chunk - 1) / chunk;
-}
+inline size_t chunk_count(size_t size) { return (size + kChunk - 1) / kChunk; }
 
 /// Call f(index of the chunk, begin, end) for all chunks of an array, at the same time
-template <typename F> void for_chunks(size_t size, const F &f, size_t chunk = kChunk) {
+template <typename F> void for_chunks(size_t size, const F &f) {
     auto run = [&](size_t i) {
-        run_with_denormals([&] { f(i, i * chunk, std::min(size, (i + 1) * chunk)); });
+        run_with_denormals([&] { f(i, i * kChunk, std::min(size, (i + 1) * kChunk)); });
     };
-    size_t count = chunk_count(size, chunk);
+    size_t count = chunk_count(size);
     if (count <= 1)
         return count == 1 ? run(0) : void();
     drjit::parallel_for(
