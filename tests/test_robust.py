@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from manylights import scenes
 from manylights.loading import has_backend
 from scipy import stats
 
@@ -361,3 +362,20 @@ def test_all_scenes_with_all_methods_are_finite(variant, name):
         scene = mi.load_dict(make())
         for method, integrator in zip(METHODS, integrators):
             assert np.isfinite(image(scene, integrator, spp=1)).all(), (key, method)
+
+
+@pytest.mark.parametrize("plugin_name", OURS)
+def test_kernels_do_not_grow_with_the_lights(llvm, plugin_name):
+    """As many kernels, of as many operations, for 100 times as many triangles."""
+    assert kernel_sizes(plugin_name, 200) == kernel_sizes(plugin_name, 20_000)
+
+
+def kernel_sizes(plugin_name, lights):
+    """Operations of each kernel of a render."""
+    scene = mi.load_dict(scenes.city(lights, width=16, height=9))
+    integrator = mi.load_dict({"type": plugin_name})
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        np.array(mi.render(scene, integrator=integrator, spp=1, seed=0))  # builds
+        dr.kernel_history_clear()
+        np.array(mi.render(scene, integrator=integrator, spp=1, seed=1))
+        return [kernel["operation_count"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
