@@ -579,12 +579,13 @@ private:
             const Moments &c = children[slot] = child(node, slot);
             flux += c.flux;
             for (int i = 0; i < 3; ++i) {
-                mean[i] += c.flux * c.mean[i];
+                // From the first child, so that nothing is rounded if all are at one place
+                mean[i] += c.flux * ((double) c.mean[i] - children[0].mean[i]);
                 axis[i] += c.flux * c.axis[i];
             }
         }
-        for (double &coordinate : mean)
-            coordinate /= flux;
+        for (int i = 0; i < 3; ++i)
+            mean[i] = children[0].mean[i] + mean[i] / flux;
         for (int slot = 0; slot < 4; ++slot) {
             const Moments &c = children[slot];
             double distance2 = 0;
