@@ -30,11 +30,11 @@ pytestmark = pytest.mark.usefixtures("plugin")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 
-ERROR = 2.5e-3
+ERROR = 3e-3
 """Relative standard error of an image mean that the number of samples is chosen for."""
 
 BIAS = 0.05
-"""Smallest bias that has to be found: 8 standard errors of the difference are 2.8 %.
+"""Smallest bias that has to be found: 8 standard errors of the difference are 3.4 %.
 
 Changes of the scenes below are much larger, and the mean of what a new tree gives is tested in
 `test_unbiased.py`.
@@ -67,10 +67,12 @@ def assert_current(scene, integrator, fresh=light_tree, sensor=0):
     assert np.array_equal(found, expected)
 
 
-def assert_right_mean(scene, integrator, known=None, label="", channels=slice(None)):
+def assert_right_mean(
+    scene, integrator, known=None, label="", channels=slice(None), error=ERROR
+):
     """The images have the mean of the reference's; returns both."""
-    images = planned_images(scene, integrator, ERROR, first_seed=0)
-    expected = planned_images(scene, known or reference(), ERROR, first_seed=100_000)
+    images = planned_images(scene, integrator, error, first_seed=0)
+    expected = planned_images(scene, known or reference(), error, first_seed=100_000)
     images, expected = images[..., channels], expected[..., channels]
     tools.assert_same_mean(images, expected, bias=BIAS, label=label)
     return images, expected
@@ -340,7 +342,7 @@ def test_refit_of_many_steps(variant):
             lower_points(scene)
             assert_current(scene, integrator)
             assert not was_refitted(integrator)
-    assert_right_mean(scene, integrator, label=variant)
+    assert_right_mean(scene, integrator, label=variant, error=2.5e-3)
 
 
 @both_variants
@@ -396,7 +398,11 @@ def test_image_that_was_not_evaluated_keeps_its_lights(llvm):
     assert not np.array_equal(after, expected)
 
 
-@both_variants
+@pytest.mark.parametrize(
+    "variant",
+    [pytest.param("scalar_rgb", marks=pytest.mark.slow), "llvm_ad_rgb"],
+    indirect=True,
+)
 def test_refit_under_nesting(variant):
     """`moment` calls `sample` alone; the mean after a refit is that of `direct`."""
     inner = light_tree()
