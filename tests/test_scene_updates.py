@@ -67,9 +67,7 @@ def assert_current(scene, integrator, fresh=light_tree, sensor=0):
     assert np.array_equal(found, expected)
 
 
-def assert_right_mean(
-    scene, integrator, known=None, label="", channels=slice(None), error=ERROR
-):
+def assert_right_mean(scene, integrator, known=None, label="", channels=slice(None), error=ERROR):
     """The images have the mean of the reference's; returns both."""
     images = planned_images(scene, integrator, error, first_seed=0)
     expected = planned_images(scene, known or reference(), error, first_seed=100_000)

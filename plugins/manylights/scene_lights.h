@@ -263,7 +263,8 @@ private:
 
     /// Never empty: kernels may refer to it with all lanes inactive
     static Storage or_empty(const Storage &array) {
-        return dr::width(array) ? array : dr::zeros<Storage>(kWideNodeFloats * kRowFloats);
+        return dr::width(array) ? array
+                                : dr::zeros<Storage>(kWideNodeFloats * kRowFloats);
     }
 
     /// The table's rows in the order of the tree
