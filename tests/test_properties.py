@@ -252,8 +252,10 @@ def check_probabilities(look):
     w = np.array(tree.probabilities(**look.receiver()), float)
     assert np.isfinite(w).all() and (w <= 1 + rounding(tree)).all()
     assert abs(w.sum() - 1) <= rounding(tree)
-    # At each level 5 % of a child's probability follow its flux alone
-    promised = (1 - rounding(tree)) * 0.05**tree.depth * flux / flux.sum()
+    # At each level 5 % of a child's probability follow its flux alone, of which both the share
+    # and the sum of the shares are rounded
+    level = 0.05 * (1 - 2 * STORED)
+    promised = (1 - rounding(tree)) * level**tree.depth * flux / flux.sum()
     possible = promised > 2 * SMALLEST
     assert (w[possible] >= promised[possible]).all()
 

@@ -134,10 +134,14 @@ ChildWeights<Float> child_weights(const TreeView<Float> &tree, const Receiver<Fl
        same, but blurs lights: .055 in place of .012 of relative variance where some of them
        are 1e6 times as far away as others, 1.5 in place of .025 at 1e-6 units from one.) */
     auto usable = sum > 1e-30f && sum < 1e30f;
-    Float share =
-        dr::select(usable, sum * (kDefensiveShare / (1.f - kDefensiveShare)), Float(1.f));
+    // A power of two brings the sum to [1, 2): small shares of the flux would vanish
+    using UInt32 = dr::uint32_array_t<Float>;
+    Float scale  = dr::reinterpret_array<Float>(
+        0x7f000000u - (dr::reinterpret_array<UInt32>(sum) & 0x7f800000u));
+    Float share = dr::select(
+        usable, sum * scale * (kDefensiveShare / (1.f - kDefensiveShare)), Float(1.f));
     Four<Float> weight =
-        dr::fmadd(clusters.flux, Four<Float>(share), dr::select(usable, h, 0.f));
+        dr::fmadd(clusters.flux, Four<Float>(share), dr::select(usable, h * scale, 0.f));
     ChildWeights<Float> result;
     Float end(0.f);
     for (size_t i = 0; i < 4; ++i) {
