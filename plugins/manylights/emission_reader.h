@@ -6,6 +6,7 @@
  */
 
 #include "light.h"
+#include "loop.h"
 #include "parameter_reader.h"
 #include <cmath>
 #include <cstring>
@@ -150,7 +151,7 @@ template <typename Float, typename Spectrum> struct EmissionReader {
         if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
             return color[0];
         mitsuba::Color<float, 3> rgb(color[0], color[1], color[2]);
-        return std::copysign(dr::norm(rgb) * .57735027f, dr::sum(rgb));
+        return std::copysign(root_mean_square(rgb), dr::sum(rgb));
     }
 
 private:

@@ -59,15 +59,6 @@ template <typename Float> struct TreeView {
     }
 };
 
-/// One coordinate of an axis that \ref pack_axis packed into signed fields of 10 bits
-template <typename Value>
-Value unpack_axis(const dr::uint32_array_t<Value> &packed, int coordinate) {
-    // Shifted up without a sign, where no bit is one too many, and down with it
-    auto upper =
-        dr::reinterpret_array<dr::int32_array_t<Value>>(packed << (22 - 10 * coordinate));
-    return Value(upper >> 22) * (1.f / 511.f);
-}
-
 /// A wide node, gathered
 template <typename Float> struct WideNodeView {
     using UInt32 = dr::uint32_array_t<Float>;
@@ -99,8 +90,8 @@ private:
         for (int i = 0; i < 3; ++i)
             clusters.mean[i] = four(4 * i);
         U4 moments        = dr::reinterpret_array<U4>(four(12));
-        clusters.flux     = dr::reinterpret_array<Four<Float>>(moments & 0xffff0000u);
-        clusters.variance = dr::reinterpret_array<Four<Float>>(dr::sl<16>(moments));
+        clusters.flux     = unpack_flux<Four<Float>>(moments);
+        clusters.variance = unpack_variance<Four<Float>>(moments);
         for (size_t i = 0; i < 4; ++i)
             child.entry(i) = dr::reinterpret_array<UInt32>(read(16 + i));
         if (tree.directions != Directions::All) {

@@ -29,6 +29,11 @@ void loop(State &state, const Cond &cond, const Body &body, const char *name) {
 /// these, so that gradients flow through the chosen lights' values only
 template <typename T> auto plain(const T &value) { return dr::detach<false>(value); }
 
+/// Root mean square of the channels of a colour
+template <typename Color> auto root_mean_square(const Color &color) {
+    return dr::norm(color) * .57735027f;
+}
+
 /// Four numbers: an array of four JIT variables, or one SIMD register
 template <typename Float>
 using Four = std::conditional_t<dr::is_jit_v<Float>, dr::Array<Float, 4>,

@@ -23,7 +23,7 @@ public:
         UnpolarizedSpectrum v = mitsuba::unpolarized_spectrum(value);
         Float result;
         if constexpr (mitsuba::is_rgb_v<Spectrum>)
-            result = dr::norm(v) * .57735027f; // root mean square (emission_reader.h)
+            result = root_mean_square(v); // why: see emission_reader.h
         else
             result = dr::mean(v);
         FloatD g = plain(result);

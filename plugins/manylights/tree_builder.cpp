@@ -515,14 +515,6 @@ private:
 
 // ------------------------------------------------------------------------------- Refit
 
-float unpack_coordinate(uint32_t packed, int coordinate) {
-    return (float) ((int32_t) (packed << (22 - 10 * coordinate)) >> 22) * (1.f / 511.f);
-}
-
-float unpack_variance(uint32_t moments) {
-    return dr::reinterpret_array<float>(moments << 16);
-}
-
 /// What a wide node is to its parent
 struct Moments {
     double flux;
@@ -565,9 +557,9 @@ private:
         leaf.flux = child == 0 ? 0 : (double) m_flux[child & ~kLeafBit];
         for (int i = 0; i < 3; ++i) {
             leaf.mean[i] = node.mean[i][slot];
-            leaf.axis[i] = unpack_coordinate(node.axis[slot], i);
+            leaf.axis[i] = unpack_axis<float>(node.axis[slot], i);
         }
-        leaf.variance = unpack_variance(node.moments[slot]);
+        leaf.variance = unpack_variance<float>(node.moments[slot]);
         return leaf;
     }
 

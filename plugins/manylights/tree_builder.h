@@ -102,7 +102,24 @@ void refit_tree(WideNode *nodes, size_t count, const HostVector<float> &flux);
 /// Upper halves of two floats, rounded to nearest: flux (never rounded to 0) and variance
 uint32_t pack_moments(float flux, float variance);
 
+template <typename Value> Value unpack_flux(const drjit::uint32_array_t<Value> &packed) {
+    return drjit::reinterpret_array<Value>(packed & 0xffff0000u);
+}
+template <typename Value>
+Value unpack_variance(const drjit::uint32_array_t<Value> &packed) {
+    return drjit::reinterpret_array<Value>(packed << 16);
+}
+
 /// Quantize a vector of length <= 1 to three signed numbers of 10 bits, in units of 1/511
 uint32_t pack_axis(const float axis[3]);
+
+/// One of its coordinates
+template <typename Value>
+Value unpack_axis(const drjit::uint32_array_t<Value> &packed, int coordinate) {
+    // Shifted up without a sign, where no bit is one too many, and down with it
+    auto upper = drjit::reinterpret_array<drjit::int32_array_t<Value>>(
+        packed << (22 - 10 * coordinate));
+    return Value(upper >> 22) * (1.f / 511.f);
+}
 
 } // namespace manylights
