@@ -104,7 +104,7 @@ public:
                            Mask active) const {
         if (m_items == 0)
             return Spectrum(0.f);
-        if (m_params.traces_all())
+        if (m_params.traces_all() || rays_for_all(vertex))
             return trace_candidates(vertex, counts, active);
         return trace_kept(vertex, keep_lights(vertex, counts, active), active);
     }
@@ -360,6 +360,12 @@ private:
         return Rng(1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(stream));
     }
 
+    /// Numbers for shadow rays through heterogeneous media
+    Rng media_rng(const Vertex &vertex) const {
+        return m_media.kinds().heterogeneous ? make_rng(plain_sample(vertex.u), 2)
+                                             : Rng();
+    }
+
     // ------------------------------------------------------------------------ Stage 3
 
     Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
@@ -379,9 +385,7 @@ private:
             Rng rng;
             DRJIT_STRUCT(State, ray, result, rng)
         };
-        State state{ UInt32D(0), Spectrum(0.f), Rng() };
-        if (m_media.kinds().heterogeneous)
-            state.rng = make_rng(plain_sample(vertex.u), 2);
+        State state{ UInt32D(0), Spectrum(0.f), media_rng(vertex) };
         UInt32D rays = dr::minimum(vertex.effort.shadow_rays, m_items);
         MaskD on     = plain(active);
         loop(
@@ -402,19 +406,39 @@ private:
         return state.result;
     }
 
-    /// Method `adaptive_splitting`: no resampling, a shadow ray for every candidate
+    /// Are there enough shadow rays for all lights? Nothing has to be chosen then. Kernels
+    /// are the same for all vertices
+    bool rays_for_all(const Vertex &vertex) const {
+        if constexpr (dr::is_jit_v<Float>)
+            return m_all && !m_choose;
+        else
+            return m_all && m_items <= vertex.effort.shadow_rays;
+    }
+
+    /// No resampling, a shadow ray for every candidate: few lights, or the method
+    /// `adaptive_splitting`
     Spectrum trace_candidates(const Vertex &vertex, Counts<Float> &counts,
                               Mask active) const {
-        if (m_all)
-            return trace_candidates(vertex,
-                                    AllLights<FloatD>(dr::opaque<UInt32D>(light_count())),
-                                    counts, active);
-        return trace_candidates(vertex, splitting_cursor(vertex.at, plain(vertex.u.tree)),
-                                counts, active);
+        Spectrum result(0.f);
+        if (m_all && m_slots > 0)
+            result = trace_candidates(
+                vertex, AllLights<FloatD>(dr::opaque<UInt32D>(light_count())),
+                media_rng(vertex), counts, active);
+        else if (!m_all)
+            result = trace_candidates(vertex,
+                                      splitting_cursor(vertex.at, plain(vertex.u.tree)),
+                                      make_rng(plain_sample(vertex.u)), counts, active);
+        if (infinite_items() == 0)
+            return result;
+        InfiniteSamples infinite = sample_infinite(vertex, active);
+        Rng rng                  = media_rng(vertex);
+        for (size_t i = 0; i < infinite_items(); ++i)
+            result += trace_sample(vertex, infinite[i], rng, active);
+        return result;
     }
 
     template <typename Cursor>
-    Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor,
+    Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor, Rng &&rng,
                               Counts<Float> &counts, Mask active) const {
         struct State {
             Cursor cursor;
@@ -425,7 +449,7 @@ private:
             State(const Cursor &cursor, Rng &&rng)
                 : cursor(cursor), slot(0), result(0.f), rng(std::move(rng)) {}
         };
-        State state(cursor, make_rng(plain_sample(vertex.u)));
+        State state(cursor, std::move(rng));
         MaskD on = plain(active);
         loop(
             state, [&](const State &s) { return on && s.cursor.has_next(); },
@@ -441,9 +465,6 @@ private:
             },
             "Direct light: rays to all candidates");
         counts.add(state.slot, state.cursor.visits, active);
-        InfiniteSamples infinite = sample_infinite(vertex, active);
-        for (size_t i = 0; i < infinite_items(); ++i)
-            state.result += trace_sample(vertex, infinite[i], state.rng, active);
         return state.result;
     }
 

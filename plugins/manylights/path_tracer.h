@@ -90,7 +90,9 @@ private:
     };
 
     void step(State &s) const {
-        Piece piece = fly(s);
+        Piece piece;
+        if (m_media)
+            fly(s, piece);
         // A segment's light is done, whatever the flight: so the surface behind is seen, too
         Mask surface = s.active && (!piece.scattered || piece.segment);
         SurfaceInteraction3f si =
@@ -110,9 +112,9 @@ private:
             return;
         surface &= s.active;
 
-        Vertex vertex =
-            m_direct.prepare(si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
-                             plain(s.depth == 0u), surface || piece.inside.here);
+        Vertex vertex = m_direct.prepare(
+            si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
+            plain(s.depth == 0u), m_media ? surface || piece.inside.here : surface);
         add_direct_light(s, vertex, piece, surface);
         scatter(s, vertex, piece);
         play_roulette(s);
@@ -126,31 +128,24 @@ private:
         /// The medium, where the path is in one; `here` if its vertex is a point in it
         InMedium inside;
         /// Was it scattered before it reached the surface?
-        Mask scattered;
+        Mask scattered = false;
         /// Is single scattering estimated along all of it? Factor of the light of its vertex
-        Mask segment;
-        UnpolarizedSpectrum seen;
+        Mask segment             = false;
+        UnpolarizedSpectrum seen = 1.f;
         /// Factor of the path that goes on
-        UnpolarizedSpectrum weight;
+        UnpolarizedSpectrum weight = 1.f;
         /// The segment as the tree sees it, and its random number
         Receiver<FloatD> along;
         Float u_tree;
     };
 
     /// Move through the medium that the path is in
-    Piece fly(State &s) const {
-        Piece piece{ { s.medium, dr::zeros<MediumInteraction3f>(), Mask(false), s.ray.o,
-                       Float(0.f) },
-                     Mask(false),
-                     Mask(false),
-                     UnpolarizedSpectrum(1.f),
-                     UnpolarizedSpectrum(1.f),
-                     dr::zeros<Receiver<FloatD>>(),
-                     Float(0.f) };
-        if (!m_media)
-            return piece;
+    void fly(State &s, Piece &piece) const {
         InMedium &inside = piece.inside;
-        Mask within      = s.active && s.medium != nullptr;
+        inside      = { s.medium, dr::zeros<MediumInteraction3f>(), false, s.ray.o, 0.f };
+        piece.along = dr::zeros<Receiver<FloatD>>();
+        piece.u_tree = 0.f;
+        Mask within  = s.active && s.medium != nullptr;
         if (dr::any_or<true>(within)) {
             auto flight =
                 m_direct.media().fly(s.medium, s.ray, s.pi.t, s.sampler, within);
@@ -166,7 +161,6 @@ private:
         }
         inside.mei.time        = s.ray.time;
         inside.mei.wavelengths = s.ray.wavelengths;
-        return piece;
     }
 
     /// Is this a piece whose single scattering is estimated as a whole?
@@ -194,7 +188,9 @@ private:
             active &= s.depth > 0u || si.is_valid();
         const auto &emission = m_direct.emission();
         auto light           = emission.light_at(si, active);
-        Spectrum radiance    = emission.emitted(si, light, active);
+        if (dr::none_or<false>(light != kNone || !si.is_valid()))
+            return;
+        Spectrum radiance = emission.emitted(si, light, active);
         Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
                                                light, active && !s.specular);
         Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
