@@ -503,14 +503,14 @@ private:
     /// What arrives of a sample: all or nothing without media
     Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
                      Mask active) const {
+        if (!vertex.inside) {
+            Mask occluded = m_scene->ray_test(vertex.si.spawn_ray_to(sample.p), active);
+            return sample.value & (active && !occluded);
+        }
         Interaction3f origin = vertex.origin();
         if (vertex.at.extent == Extent::Segment)
             origin.p = sample.from;
-        Ray3f ray = origin.spawn_ray_to(sample.p);
-        if (!vertex.inside) {
-            Mask occluded = m_scene->ray_test(ray, active);
-            return sample.value & (active && !occluded);
-        }
+        Ray3f ray   = origin.spawn_ray_to(sample.p);
         auto medium = m_media.medium_beyond(vertex.si, vertex.inside->medium, ray.d,
                                             vertex.on_surface(active));
         return sample.value * m_media.transmittance(ray, medium, rng, active) & active;

@@ -224,19 +224,19 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
     return importance;
 }
 
-/// A row of the table, gathered
+/// A row of the table
 template <typename Float> struct Row {
     using UInt32   = dr::uint32_array_t<Float>;
     using Mask     = dr::mask_t<Float>;
     using Vector3f = mitsuba::Vector<Float, 3>;
 
-    dr::Array<Float, kRowFloats> data;
+    /// Scalar variants read the table in place
+    std::conditional_t<dr::is_jit_v<Float>, dr::Array<Float, kRowFloats>, const Float *>
+        data;
 
-    Float operator[](size_t i) const { return data.entry(i); }
-    Vector3f vector(size_t i) const {
-        return { data.entry(i), data.entry(i + 1), data.entry(i + 2) };
-    }
-    UInt32 bits(size_t i) const { return dr::reinterpret_array<UInt32>(data.entry(i)); }
+    Float operator[](size_t i) const { return data[i]; }
+    Vector3f vector(size_t i) const { return { data[i], data[i + 1], data[i + 2] }; }
+    UInt32 bits(size_t i) const { return dr::reinterpret_array<UInt32>(data[i]); }
     UInt32 kind() const { return bits(kTag) & kTagKindMask; }
     Mask is(LightKind k) const { return kind() == (uint32_t) k; }
     Mask tabulated() const { return (bits(kTag) & kTagTabulated) != 0u; }

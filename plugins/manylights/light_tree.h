@@ -55,7 +55,10 @@ template <typename Float> struct TreeView {
     }
 
     Row<Float> row(const UInt32 &light, const Mask &active = true) const {
-        return { fetch<kRowFloats>(rows, light, active) };
+        if constexpr (dr::is_jit_v<Float>)
+            return { fetch<kRowFloats>(rows, light, active) };
+        else
+            return { rows.data() + light * kRowFloats };
     }
 };
 

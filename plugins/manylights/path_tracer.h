@@ -188,7 +188,7 @@ private:
             active &= s.depth > 0u || si.is_valid();
         const auto &emission = m_direct.emission();
         auto light           = emission.light_at(si, active);
-        if (dr::none_or<false>(light != kNone || !si.is_valid()))
+        if (dr::none_or<false>(emission.may_emit(si, light)))
             return;
         Spectrum radiance = emission.emitted(si, light, active);
         Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
@@ -242,15 +242,11 @@ private:
 
     /// Continue in a direction sampled from the BSDF or the phase function
     void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
-        Direction next = dr::zeros<Direction>();
         Float u1       = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
         Mask surface   = s.active && !piece.scattered;
-        if (dr::any_or<true>(surface))
-            next = sample_bsdf(vertex, u1, u2, surface);
-        Mask scattered = s.active && piece.scattered;
-        if (m_media && dr::any_or<true>(scattered))
-            next = merge(next, sample_phase(s, piece, u1, u2, scattered), scattered);
+        Direction next = m_media ? sample_either(s, vertex, piece, u1, u2)
+                                 : sample_bsdf(vertex, u1, u2, surface);
 
         s.throughput *= next.weight;
         if (m_media)
@@ -268,26 +264,37 @@ private:
         s.ray = next.ray;
     }
 
+    /// A direction from the BSDF or the phase function, whichever a lane has come to
+    Direction sample_either(const State &s, const Vertex &vertex, const Piece &piece,
+                            const Float &u1, const Point2f &u2) const {
+        Direction next = dr::zeros<Direction>();
+        Mask surface   = s.active && !piece.scattered;
+        if (dr::any_or<true>(surface))
+            next = sample_bsdf(vertex, u1, u2, surface);
+        Mask scattered = s.active && piece.scattered;
+        if (dr::any_or<true>(scattered))
+            next = merge(next, sample_phase(s, piece, u1, u2, scattered), scattered);
+        return next;
+    }
+
     /// What the density of finding a light by chance needs of the vertex that a path leaves
     void remember(State &s, const Vertex &vertex, const Piece &piece,
                   const Direction &next, Mask leaves) const {
         dr::masked(s.depth, leaves) = s.depth + 1u;
         if (!m_sees_lights)
             return;
-        Receiver<FloatD> at = vertex.at;
-        Float u_tree        = vertex.u.tree;
+        dr::masked(s.from, plain(leaves)) = vertex.at;
+        dr::masked(s.u_tree, leaves)      = vertex.u.tree;
+        dr::masked(s.pdf, leaves)         = dr::detach(next.pdf);
+        dr::masked(s.specular, leaves)    = next.specular;
         if (m_segments) {
-            Mask along = piece.scattered && piece.segment;
-            at         = dr::select(plain(along), piece.along, at);
-            u_tree     = dr::select(along, piece.u_tree, u_tree);
+            Mask along                       = leaves && piece.scattered && piece.segment;
+            dr::masked(s.from, plain(along)) = piece.along;
+            dr::masked(s.u_tree, along)      = piece.u_tree;
         }
-        s.from        = dr::select(plain(leaves), at, s.from);
         s.from.glossy = vertex.at.glossy;
         s.from.media  = vertex.at.media;
         s.from.extent = m_segments ? Extent::Either : Extent::Point;
-        s.u_tree      = dr::select(leaves, u_tree, s.u_tree);
-        s.pdf         = dr::select(leaves, dr::detach(next.pdf), s.pdf);
-        s.specular    = dr::select(leaves, next.specular, s.specular);
     }
 
     Direction sample_bsdf(const Vertex &vertex, const Float &u1, const Point2f &u2,

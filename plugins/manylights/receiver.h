@@ -32,18 +32,16 @@ public:
     }
 
     /// The lobe is measured only if the scene has any: it costs two evaluations of the BSDF
-    static Receiver<FloatD> read(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                                 bool glossy, Mask active) {
+    static void read(Receiver<FloatD> &at, const SurfaceInteraction3f &si,
+                     const BSDFPtr &bsdf, bool glossy, Mask active) {
         Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
         Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
-        Receiver<FloatD> at = dr::zeros<Receiver<FloatD>>();
-        at.p                = plain(si.p);
-        at.n                = plain(n);
-        at.wi               = plain(si.to_world(si.wi));
-        at.transmits        = plain(transmits);
+        at.p          = plain(si.p);
+        at.n          = plain(n);
+        at.wi         = plain(si.to_world(si.wi));
+        at.transmits  = plain(transmits);
         if (glossy)
             measure_lobe(si, bsdf, at, active);
-        return at;
     }
 
     /// The medium around a surface, or a point or a segment in the medium: no cosine, no lobe

@@ -28,6 +28,11 @@ public:
                              plain(active && si.is_valid()));
     }
 
+    /// Can there be emission where a ray has found this light?
+    Mask may_emit(const SurfaceInteraction3f &si, const UInt32D &light) const {
+        return light != kNone || (m_scene->environment() && !si.is_valid());
+    }
+
     /**
      * What a ray finds, as far as the emission there and its density depend on it, and the
      * light. Where the table knows all emission, no shape is called: normals come from the

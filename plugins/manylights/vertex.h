@@ -87,11 +87,11 @@ template <typename Float, typename Spectrum> struct Vertex {
     Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
            const LightSample<Float> &u, const Effort<FloatD> &effort, bool glossy,
            Extent extent, Mask active)
-        : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort) {
+        : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort),
+          at(dr::zeros<Receiver<FloatD>>()) {
         Mask surface = on_surface(active);
-        at           = extent == Extent::Point && dr::any_or<true>(surface)
-                           ? Reader::read(si, bsdf, glossy, surface)
-                           : dr::zeros<Receiver<FloatD>>();
+        if (extent == Extent::Point && dr::any_or<true>(surface))
+            Reader::read(at, si, bsdf, glossy, surface);
         if (inside)
             Reader::add_medium(at, *inside, active);
         at.glossy = glossy;
