@@ -120,8 +120,11 @@ public:
             value            = si.to_world_mueller(value, -bs.wo, si.wi);
             Mask active_b =
                 active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
-            auto [hit, light] =
-                m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), active_b);
+            SurfaceInteraction3f hit;
+            auto [light, emits] =
+                m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), hit, active_b);
+            if (dr::none_or<false>(emits))
+                continue;
             Spectrum radiance = m_emission.emitted(hit, light, active_b);
 
             Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
@@ -501,7 +504,7 @@ private:
     }
 
     /// What arrives of a sample: all or nothing without media
-    Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
+    MI_INLINE Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
                      Mask active) const {
         if (!vertex.inside) {
             Mask occluded = m_scene->ray_test(vertex.si.spawn_ray_to(sample.p), active);
@@ -582,7 +585,7 @@ private:
      * sign if only the target is wanted: their H times a typical BSDF value. The plugin is
      * then called for the chosen lights only.
      */
-    Sample sample_light_point(const Vertex &vertex, const UInt32D &light,
+    MI_INLINE Sample sample_light_point(const Vertex &vertex, const UInt32D &light,
                               const FloatD &inclusion, const UInt32D &slot,
                               bool target_only, Mask active) const {
         Row<FloatD> row = m_lights.tree().row(light, plain(active));
@@ -596,7 +599,7 @@ private:
         return at_distance(vertex, t, along.pdf(t), target_only, active, sample);
     }
 
-    Sample sample_row_point(const Vertex &vertex, const Row<FloatD> &row,
+    MI_INLINE Sample sample_row_point(const Vertex &vertex, const Row<FloatD> &row,
                             const FloatD &inclusion, const UInt32D &slot,
                             bool target_only, Mask active) const {
         KindSet kinds = m_lights.tree().kinds;
@@ -634,7 +637,7 @@ private:
     }
 
     /// A sample of a light of the table
-    Sample sample_row(const Vertex &vertex, const Row<FloatD> &row, const Point2f &u,
+    MI_INLINE Sample sample_row(const Vertex &vertex, const Row<FloatD> &row, const Point2f &u,
                       const FloatD &inclusion, bool target_only, Mask active) const {
         using LightPointD = LightPoint<FloatD>;
         mitsuba::Point<FloatD, 2> ud(plain(u.x()), plain(u.y()));

@@ -89,7 +89,7 @@ private:
         Mask specular, null;
     };
 
-    void step(State &s) const {
+    MI_INLINE void step(State &s) const {
         Piece piece;
         if (m_media)
             fly(s, piece);
@@ -188,7 +188,7 @@ private:
             active &= s.depth > 0u || si.is_valid();
         const auto &emission = m_direct.emission();
         auto light           = emission.light_at(si, active);
-        if (dr::none_or<false>(emission.may_emit(si, light)))
+        if (dr::none_or<false>(emission.may_emit(light, si.is_valid())))
             return;
         Spectrum radiance = emission.emitted(si, light, active);
         Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
@@ -241,7 +241,7 @@ private:
     // ----------------------------------------------------------------------- Scattering
 
     /// Continue in a direction sampled from the BSDF or the phase function
-    void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
+    MI_INLINE void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
         Float u1       = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
         Mask surface   = s.active && !piece.scattered;

@@ -28,43 +28,50 @@ public:
                              plain(active && si.is_valid()));
     }
 
-    /// Can there be emission where a ray has found this light?
-    Mask may_emit(const SurfaceInteraction3f &si, const UInt32D &light) const {
-        return light != kNone || (m_scene->environment() && !si.is_valid());
+    /// Can there be emission where a ray found this light, or nothing at all?
+    Mask may_emit(const UInt32D &light, const Mask &hit) const {
+        return light != kNone || (m_scene->environment() && !hit);
     }
 
     /**
-     * What a ray finds, as far as the emission there and its density depend on it, and the
-     * light. Where the table knows all emission, no shape is called: normals come from the
-     * rows, and there are none on surfaces that do not emit.
+     * The light that a ray finds and whether there can be emission. `si` is what it finds, as
+     * far as emission and its density depend on that; scalar variants fill it only if there
+     * can be any. Where the table knows all emission, no shape is called: normals come from
+     * the rows, and there are none on surfaces that do not emit.
      */
-    std::pair<SurfaceInteraction3f, UInt32D> find_light(const Ray3f &ray,
-                                                        Mask active) const {
+    std::pair<UInt32D, Mask> find_light(const Ray3f &ray, SurfaceInteraction3f &si,
+                                        Mask active) const {
         if (m_lights.needs_emitter_eval()) {
-            SurfaceInteraction3f si = m_scene->ray_intersect(ray, active);
-            return { si, light_at(si, active) };
+            si            = m_scene->ray_intersect(ray, active);
+            UInt32D light = light_at(si, active);
+            return { light, may_emit(light, si.is_valid()) };
         }
         auto pi = m_scene->ray_intersect_preliminary(ray, /* coherent = */ false, active);
-        Mask valid              = active && pi.is_valid();
-        SurfaceInteraction3f si = dr::zeros<SurfaceInteraction3f>();
-        si.t                    = dr::select(valid, pi.t, dr::Infinity<Float>);
-        si.p                    = dr::select(valid, ray(pi.t), ray.o);
-        si.time                 = ray.time;
-        si.wavelengths          = ray.wavelengths;
-        si.shape                = dr::select(valid, pi.shape, nullptr);
-        si.prim_index           = pi.prim_index;
-        si.wi                   = -ray.d;
-        UInt32D light           = light_at(si, active);
-        MaskD found             = light < kOnlyHit;
+        Mask valid    = active && pi.is_valid();
+        UInt32D light = kNone;
+        if (m_lights.can_be_hit())
+            light = m_lights.find(pi.shape, plain(pi.prim_index), plain(valid));
+        Mask emits = may_emit(light, valid);
+        if (dr::none_or<false>(emits))
+            return { light, emits };
+        si             = dr::zeros<SurfaceInteraction3f>();
+        si.t           = dr::select(valid, pi.t, dr::Infinity<Float>);
+        si.p           = dr::select(valid, ray(pi.t), ray.o);
+        si.time        = ray.time;
+        si.wavelengths = ray.wavelengths;
+        si.shape       = dr::select(valid, pi.shape, nullptr);
+        si.prim_index  = pi.prim_index;
+        si.wi          = -ray.d;
+        MaskD found    = light < kOnlyHit;
         if (!dr::any_or<true>(found))
-            return { si, light };
+            return { light, emits };
         Row<FloatD> row = m_lights.tree().row(light, found);
         using VectorD   = mitsuba::Vector<FloatD, 3>;
         si.n  = by_kind<VectorD>(row, m_lights.table_kinds(), [&](LightKind kind) {
             return light_normal<FloatD>(row, kind, plain(si.p));
         });
         si.wi = dr::select(valid, Vector3f(0.f, 0.f, dr::dot(si.n, si.wi)), si.wi);
-        return { si, light };
+        return { light, emits };
     }
 
     /// Radiance emitted from a surface, which is `light`, or from the environment, against

@@ -218,7 +218,9 @@ public:
             UInt32D light = dr::gather<UInt32D>(m_light_of_primitive, index, known);
             return dr::select(known, light, kNone);
         } else {
-            auto it = active ? m_shape_map.find(shape) : m_shape_map.end();
+            // Most shapes do not emit: do not look for these
+            bool emits = active && shape->emitter() != nullptr;
+            auto it    = emits ? m_shape_map.find(shape) : m_shape_map.end();
             if (it == m_shape_map.end())
                 return kNone;
             return m_light_of_primitive
