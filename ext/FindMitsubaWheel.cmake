@@ -74,6 +74,9 @@ target_include_directories(Mitsuba::abi INTERFACE
 target_compile_definitions(Mitsuba::abi INTERFACE
   MI_ENABLE_CUDA=1 MI_ENABLE_LLVM=1 MI_ENABLE_EMBREE=1 MI_ENABLE_AUTODIFF=1)
 target_compile_options(Mitsuba::abi INTERFACE -fno-strict-aliasing)
+# Nobody asks for errno or floating point exceptions, and both forbid short code: 1 % less
+# instructions of scalar variants, the same numbers.
+target_compile_options(Mitsuba::abi INTERFACE -fno-math-errno -fno-trapping-math)
 # The wheel's size and alignment of arrays are those of AVX2. Other architectures have one
 # baseline, and GCC does not know this name there.
 if(CMAKE_SYSTEM_PROCESSOR MATCHES "^(x86_64|amd64|AMD64)$")

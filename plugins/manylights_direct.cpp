@@ -161,7 +161,14 @@ public:
                                      Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         DirectLight direct(scene, m_cache.get(scene, sampler), m_params);
+        return manylights::call_flat<Float>(
+            [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
+    }
 
+    /// Radiance along a ray, and whether it met anything
+    std::pair<Spectrum, Mask> radiance(const Scene *scene, const DirectLight &direct,
+                                       Sampler *sampler, const RayDifferential3f &ray,
+                                       Float *aovs, Mask active) const {
         auto pi = scene->ray_intersect_preliminary(ray, /* coherent = */ true, active);
         if (m_hide_emitters)
             manylights::skip_emitters(scene, Ray3f(ray), pi, active);

@@ -161,7 +161,8 @@ public:
         PathTracer tracer(scene, lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;
-        auto result = tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+        auto result = manylights::call_flat<Float>(
+            [&] { return tracer.trace(sampler, Ray3f(ray), medium, counts, active); });
         if (m_params.counts)
             counts.write(aovs);
         return result;

@@ -142,9 +142,9 @@ public:
      * Density with which \ref sample_lights chooses the direction that hit `light` or the
      * environment, seen from the receiver of a vertex and for its random number of the tree
      */
-    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree, const MaskD &first,
-                      const SurfaceInteraction3f &hit, const UInt32D &light,
-                      Mask active) const {
+    MI_NOINLINE Float hit_density(const Receiver<FloatD> &at, const Float &u_tree,
+                                  const MaskD &first, const SurfaceInteraction3f &hit,
+                                  const UInt32D &light, Mask active) const {
         auto p = at.p;
         if (at.extent == Extent::Either)
             p -= at.distance * at.wi;
@@ -217,7 +217,8 @@ private:
     // --------------------------------------------------------------- Stages 1 and 2
 
     /// Choices are not differentiated: no gradient passes through here
-    Kept keep_lights(const Vertex &vertex, Counts<Float> &counts, Mask active) const {
+    MI_NOINLINE Kept keep_lights(const Vertex &vertex, Counts<Float> &counts,
+                                 Mask active) const {
         dr::suspend_grad<Float> detached;
         LightSample<FloatD> u = plain_sample(vertex.u);
         auto keep             = [&](const auto &cursor) {
@@ -371,7 +372,7 @@ private:
 
     // ------------------------------------------------------------------------ Stage 3
 
-    Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
+    MI_NOINLINE Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
         InfiniteSamples infinite = sample_infinite(vertex, active);
         FloatD offset            = plain(vertex.u.selection);
         FloatD tau(0.f);
@@ -504,7 +505,7 @@ private:
     }
 
     /// What arrives of a sample: all or nothing without media
-    MI_INLINE Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
+    Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
                      Mask active) const {
         if (!vertex.inside) {
             Mask occluded = m_scene->ray_test(vertex.si.spawn_ray_to(sample.p), active);
@@ -551,8 +552,9 @@ private:
      * target, sigma_t in place of sigma_s).
      */
     template <typename F>
-    Sample at_distance(const Vertex &vertex, const FloatD &t, const FloatD &pdf,
-                       bool target_only, Mask active, const F &f) const {
+    MI_NOINLINE Sample at_distance(const Vertex &vertex, const FloatD &t,
+                                   const FloatD &pdf, bool target_only, Mask active,
+                                   const F &f) const {
         Mask segment                    = active && Mask(vertex.at.length > 0.f);
         typename Vertex::InMedium here  = *vertex.inside;
         dr::masked(here.mei.p, segment) = here.start - Float(t) * here.mei.wi;
@@ -585,21 +587,21 @@ private:
      * sign if only the target is wanted: their H times a typical BSDF value. The plugin is
      * then called for the chosen lights only.
      */
-    MI_INLINE Sample sample_light_point(const Vertex &vertex, const UInt32D &light,
+    Sample sample_light_point(const Vertex &vertex, const UInt32D &light,
                               const FloatD &inclusion, const UInt32D &slot,
                               bool target_only, Mask active) const {
         Row<FloatD> row = m_lights.tree().row(light, plain(active));
-        auto sample     = [&](const Vertex &v) {
-            return sample_row_point(v, row, inclusion, slot, target_only, active);
-        };
         if (vertex.at.extent == Extent::Point)
-            return sample(vertex);
+            return sample_row_point(vertex, row, inclusion, slot, target_only, active);
         Distances along = distances(vertex.at, row);
         FloatD t        = along.sample(slot_distance(vertex, slot));
-        return at_distance(vertex, t, along.pdf(t), target_only, active, sample);
+        return at_distance(
+            vertex, t, along.pdf(t), target_only, active, [&](const Vertex &v) {
+                return sample_row_point(v, row, inclusion, slot, target_only, active);
+            });
     }
 
-    MI_INLINE Sample sample_row_point(const Vertex &vertex, const Row<FloatD> &row,
+    Sample sample_row_point(const Vertex &vertex, const Row<FloatD> &row,
                             const FloatD &inclusion, const UInt32D &slot,
                             bool target_only, Mask active) const {
         KindSet kinds = m_lights.tree().kinds;
@@ -637,7 +639,7 @@ private:
     }
 
     /// A sample of a light of the table
-    MI_INLINE Sample sample_row(const Vertex &vertex, const Row<FloatD> &row, const Point2f &u,
+    Sample sample_row(const Vertex &vertex, const Row<FloatD> &row, const Point2f &u,
                       const FloatD &inclusion, bool target_only, Mask active) const {
         using LightPointD = LightPoint<FloatD>;
         mitsuba::Point<FloatD, 2> ud(plain(u.x()), plain(u.y()));
@@ -701,7 +703,7 @@ private:
         return count <= kMaxInfinite ? 1.f : 1.f / count;
     }
 
-    InfiniteSamples sample_infinite(const Vertex &vertex, Mask active) const {
+    MI_NOINLINE InfiniteSamples sample_infinite(const Vertex &vertex, Mask active) const {
         InfiniteSamples samples;
         float p = infinite_probability();
         for (uint32_t i = 0; i < infinite_items(); ++i) {

@@ -114,8 +114,8 @@ public:
      *
      * @param medium  medium around the origin of the ray, null for none
      */
-    Spectrum transmittance(const Ray3f &to_light, const MediumPtr &medium, const Rng &rng,
-                           Mask active) const {
+    MI_NOINLINE Spectrum transmittance(const Ray3f &to_light, const MediumPtr &medium,
+                                       const Rng &rng, Mask active) const {
         struct State {
             Mask active;
             Ray3f ray;

@@ -75,10 +75,9 @@ private:
                      eta, from, u_tree, pdf, specular, counts, sampler)
 
         State(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
-            : active(active), valid(false), depth(0), ray(ray),
-              pi(dr::zeros<PreliminaryIntersection3f>()), medium(medium), throughput(1.f),
-              result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()), u_tree(0.f),
-              pdf(1.f), specular(true), sampler(sampler) {}
+            : active(active), valid(false), depth(0), ray(ray), medium(medium),
+              throughput(1.f), result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()),
+              u_tree(0.f), pdf(1.f), specular(true), sampler(sampler) {}
     };
 
     /// Where a path goes on
@@ -89,7 +88,7 @@ private:
         Mask specular, null;
     };
 
-    MI_INLINE void step(State &s) const {
+    void step(State &s) const {
         Piece piece;
         if (m_media)
             fly(s, piece);
@@ -140,7 +139,7 @@ private:
     };
 
     /// Move through the medium that the path is in
-    void fly(State &s, Piece &piece) const {
+    MI_NOINLINE void fly(State &s, Piece &piece) const {
         InMedium &inside = piece.inside;
         inside      = { s.medium, dr::zeros<MediumInteraction3f>(), false, s.ray.o, 0.f };
         piece.along = dr::zeros<Receiver<FloatD>>();
@@ -199,8 +198,8 @@ private:
     }
 
     /// Single scattering along a whole piece of the path, whatever its flight
-    void add_segment_light(State &s, const SurfaceInteraction3f &behind,
-                           Piece &piece) const {
+    MI_NOINLINE void add_segment_light(State &s, const SurfaceInteraction3f &behind,
+                                       Piece &piece) const {
         Mask active = s.active && piece.segment;
         if (dr::none_or<false>(active))
             return;
@@ -241,7 +240,7 @@ private:
     // ----------------------------------------------------------------------- Scattering
 
     /// Continue in a direction sampled from the BSDF or the phase function
-    MI_INLINE void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
+    void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
         Float u1       = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
         Mask surface   = s.active && !piece.scattered;
@@ -265,8 +264,9 @@ private:
     }
 
     /// A direction from the BSDF or the phase function, whichever a lane has come to
-    Direction sample_either(const State &s, const Vertex &vertex, const Piece &piece,
-                            const Float &u1, const Point2f &u2) const {
+    MI_NOINLINE Direction sample_either(const State &s, const Vertex &vertex,
+                                        const Piece &piece, const Float &u1,
+                                        const Point2f &u2) const {
         Direction next = dr::zeros<Direction>();
         Mask surface   = s.active && !piece.scattered;
         if (dr::any_or<true>(surface))

@@ -36,17 +36,18 @@ public:
                      const BSDFPtr &bsdf, bool glossy, Mask active) {
         Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
         Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
-        at.p          = plain(si.p);
-        at.n          = plain(n);
-        at.wi         = plain(si.to_world(si.wi));
-        at.transmits  = plain(transmits);
+        at.p           = plain(si.p);
+        at.n           = plain(n);
+        at.wi          = plain(si.to_world(si.wi));
+        at.transmits   = plain(transmits);
         if (glossy)
             measure_lobe(si, bsdf, at, active);
     }
 
     /// The medium around a surface, or a point or a segment in the medium: no cosine, no lobe
     template <typename InMedium>
-    static void add_medium(Receiver<FloatD> &at, const InMedium &inside, Mask active) {
+    MI_NOINLINE static void add_medium(Receiver<FloatD> &at, const InMedium &inside,
+                                       Mask active) {
         active &= inside.medium != nullptr;
         if (dr::any_or<true>(active))
             active &= inside.medium->is_homogeneous();
@@ -71,8 +72,9 @@ private:
      * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.
      * Only h and H see this, so it does not have to be right.
      */
-    static void measure_lobe(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
-                             Receiver<FloatD> &at, Mask active) {
+    MI_NOINLINE static void measure_lobe(const SurfaceInteraction3f &si,
+                                         const BSDFPtr &bsdf, Receiver<FloatD> &at,
+                                         Mask active) {
         dr::suspend_grad<Float> detached;
         mitsuba::BSDFContext ctx;
         Float cos_i = Frame3f::cos_theta(si.wi);

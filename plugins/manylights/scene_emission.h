@@ -76,8 +76,8 @@ public:
 
     /// Radiance emitted from a surface, which is `light`, or from the environment, against
     /// the ray that found it
-    Spectrum emitted(const SurfaceInteraction3f &si, const UInt32D &light,
-                     Mask active) const {
+    MI_NOINLINE Spectrum emitted(const SurfaceInteraction3f &si, const UInt32D &light,
+                                 Mask active) const {
         Spectrum result(0.f);
         if (m_lights.can_be_hit()) {
             Mask in_table = light < kOnlyHit, by_plugin = light == kOnlyHit;
@@ -125,9 +125,10 @@ public:
     }
 
     /// Radiance of a triangle whose emission varies, from its emitter
-    Spectrum triangle_emission(const Interaction3f &from, const Row<FloatD> &row,
-                               const LightPoint<FloatD> &point, const Vector3f &d,
-                               Mask active) const {
+    MI_NOINLINE Spectrum triangle_emission(const Interaction3f &from,
+                                           const Row<FloatD> &row,
+                                           const LightPoint<FloatD> &point,
+                                           const Vector3f &d, Mask active) const {
         EmitterPtr emitter           = emitter_of(row);
         PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
         MaskD flipped                = row[kColor + 1] > 0.f;

@@ -84,7 +84,7 @@ template <typename Float, typename Spectrum> struct Vertex {
     /// sampling and phase sampling are compared as densities of distance and direction
     Float flight_ratio = Float(1.f);
 
-    MI_INLINE Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
+    Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
            const LightSample<Float> &u, const Effort<FloatD> &effort, bool glossy,
            Extent extent, Mask active)
         : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort),
