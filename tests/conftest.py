@@ -14,9 +14,19 @@ from manylights.loading import has_backend
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono_polarized")
 """Variants that the tests run in by default."""
 
+BACKEND = os.environ.get("MANYLIGHTS_TEST_BACKEND", "llvm")
+"""What runs the tests of LLVM variants: `llvm`, or `cuda` for the CUDA variants instead."""
+
+NO_INFINITY = "OptiX finds no surface at all in a scene with a vertex at infinity"
+"""Why a test is skipped in CUDA variants."""
+
 
 def require_variant(name):
-    """Skip the test if this machine cannot run the variant, else make it the current one."""
+    """Skip the test if this machine cannot run the variant, else make it the current one.
+
+    Returns its name: another one than `name` if `BACKEND` is `cuda`.
+    """
+    name = name.replace("llvm", BACKEND)
     if name not in mi.variants():
         pytest.skip(f"this Mitsuba has no variant {name}")
     if name.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
@@ -24,6 +34,7 @@ def require_variant(name):
     if name.startswith("cuda") and not has_backend(dr.JitBackend.CUDA):
         pytest.skip(f"{name} needs an NVIDIA driver and GPU")
     mi.set_variant(name)
+    return name
 
 
 def heed_ctrl_c():
@@ -40,22 +51,19 @@ def variant(request):
 
     Other variants: `@pytest.mark.parametrize("variant", [...], indirect=True)`.
     """
-    require_variant(request.param)
-    return request.param
+    return require_variant(request.param)
 
 
 @pytest.fixture
 def llvm():
-    """The variant llvm_ad_rgb, or a skip."""
-    require_variant("llvm_ad_rgb")
-    return "llvm_ad_rgb"
+    """The variant llvm_ad_rgb, or what `BACKEND` makes of it, or a skip."""
+    return require_variant("llvm_ad_rgb")
 
 
 @pytest.fixture
 def scalar():
     """The variant scalar_rgb."""
-    require_variant("scalar_rgb")
-    return "scalar_rgb"
+    return require_variant("scalar_rgb")
 
 
 @pytest.fixture(scope="session")

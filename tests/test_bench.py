@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 
-import drjit as dr
 import manylights
 import mitsuba as mi
 import numpy as np
@@ -28,9 +27,8 @@ from manylights.bench.moments import Moments
 from manylights.bench.workload import Workload
 from manylights.cli import main
 from manylights.errors import UsageError
-from manylights.loading import has_backend
 
-from tests.conftest import heed_ctrl_c
+from tests.conftest import heed_ctrl_c, require_variant
 
 pytest.importorskip("flip_evaluator")
 
@@ -409,8 +407,7 @@ def test_results_of_finished_scenes_are_kept_if_a_later_one_fails(capsys, tmp_pa
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_ctrl_c_keeps_results_and_the_same_command_goes_on(tmp_path, variant):
-    if variant.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
-        pytest.skip("no libLLVM")
+    variant = require_variant(variant)
     out = tmp_path / "out"
     # Enough seeds to be still at work when the signal comes.
     arguments = ["bench", CITY, "--methods", "uniform,power", "--spp", "1,2", "--out", out]

@@ -9,16 +9,14 @@ import sys
 import time
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import __version__, cli, integrators, loading, rendering
 from manylights.errors import UsageError
-from manylights.loading import has_backend
 from manylights.progress import Estimate, format_seconds
 
-from tests.conftest import heed_ctrl_c
+from tests.conftest import heed_ctrl_c, require_variant
 
 SCENES = Path(__file__).parent.parent / "scenes"
 
@@ -146,8 +144,7 @@ def test_render_writes_image_and_preview(scene, tmp_path):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_same_seed_gives_the_same_bytes(scene, tmp_path, variant):
-    if variant.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
-        pytest.skip("no libLLVM")
+    variant = require_variant(variant)
     images = []
     for index, (seed, threads) in enumerate([(5, 1), (5, 2), (6, 2)]):
         out = tmp_path / f"{index}.exr"
@@ -557,11 +554,8 @@ def test_seeds_of_passes_differ_and_the_first_is_the_seed():
     assert rendering.pass_seed(7, 0) == 7
 
 
-def test_passes_give_the_mean_of_their_samples(monkeypatch):
+def test_passes_give_the_mean_of_their_samples(llvm, monkeypatch):
     """Five passes are the mean of five renders, weighted by samples, in all channels."""
-    if not has_backend(dr.JitBackend.LLVM):
-        pytest.skip("no libLLVM")
-    mi.set_variant("llvm_ad_rgb")
     monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", 0)
     loaded = loading.load(str(SCENES / "aov.xml"), {"resx": "24", "resy": "16"})
     fractions = []
@@ -599,8 +593,7 @@ def test_times_are_readable(seconds, text):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_ctrl_c_leaves_no_file(tmp_path, variant):
-    if variant.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
-        pytest.skip("no libLLVM")
+    variant = require_variant(variant)
     out = tmp_path / "out.exr"
     command = [sys.executable, "-m", "manylights", "render", SCENES / "points.xml", "-o", out]
     command += ["--spp", "200000", "--variant", variant]

@@ -39,14 +39,12 @@ def merged_ids(scene, **options):
 @pytest.fixture(params=["scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono"])
 def any_variant(request):
     """Variants in which attributes are what lights are; these tests need no integrator."""
-    require_variant(request.param)
-    return request.param
+    return require_variant(request.param)
 
 
 @pytest.fixture(params=["scalar_rgb", "llvm_ad_rgb"])
 def rendering_variant(request):
-    require_variant(request.param)
-    return request.param
+    return require_variant(request.param)
 
 
 def rays():

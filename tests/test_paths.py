@@ -127,16 +127,14 @@ def test_mean_in_scalar_variant(scalar, name):
 @pytest.mark.parametrize("name", quick_and_slow(path_scenes.SCENES, QUICK_SPECTRAL))
 def test_mean_in_spectral_variant(name):
     """Spectra with random wavelengths."""
-    require_variant("llvm_ad_spectral")
-    assert_unbiased(name, "llvm_ad_spectral")
+    assert_unbiased(name, require_variant("llvm_ad_spectral"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", POLARIZED)
 def test_mean_in_polarized_variant(name):
     """Mueller matrices."""
-    require_variant("llvm_ad_mono_polarized")
-    assert_unbiased(name, "llvm_ad_mono_polarized")
+    assert_unbiased(name, require_variant("llvm_ad_mono_polarized"))
 
 
 @pytest.mark.parametrize("depth", quick_and_slow(DEPTHS, [9]))

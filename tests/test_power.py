@@ -32,8 +32,7 @@ def load(**emitters):
 def each_variant(request):
     from tests.conftest import require_variant
 
-    require_variant(request.param)
-    return request.param
+    return require_variant(request.param)
 
 
 @pytest.fixture

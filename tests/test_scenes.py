@@ -3,14 +3,14 @@
 import re
 from pathlib import Path
 
-import drjit as dr
 import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import loading, scenes, tree
-from manylights.loading import has_backend
 from manylights.scenes import _build
+
+from tests.conftest import require_variant
 
 SCENES = Path(__file__).parent.parent / "scenes"
 FILES = sorted(SCENES.glob("*.xml"))
@@ -22,10 +22,7 @@ COUNTED = [name for name in scenes.names() if name != "on_emitter"]
 
 @pytest.fixture(params=VARIANTS)
 def each_variant(request):
-    if request.param.startswith("llvm") and not has_backend(dr.JitBackend.LLVM):
-        pytest.skip("no libLLVM")
-    mi.set_variant(request.param)
-    return request.param
+    return require_variant(request.param)
 
 
 @pytest.fixture

@@ -175,8 +175,7 @@ def test_mean_in_spectral_variant(name):
 @pytest.mark.parametrize("name", SUBSET)
 def test_mean_in_polarized_variant(name):
     """Mueller matrices."""
-    require_variant("llvm_ad_mono_polarized")
-    assert_unbiased(name, "llvm_ad_mono_polarized", ("exhaustive",))
+    assert_unbiased(name, require_variant("llvm_ad_mono_polarized"), ("exhaustive",))
 
 
 @pytest.mark.parametrize("name", [name for name in SUBSET if name not in SLOW_SCENES])

@@ -5,6 +5,7 @@
  * numbers in RGB and monochrome variants, D65 times an upsampled colour in spectral ones.
  */
 
+#include "device_scalars.h"
 #include "light.h"
 #include "loop.h"
 #include "parameter_reader.h"
@@ -38,6 +39,10 @@ void read_scalars(const Float *const (&values)[Count], float (&out)[Count]) {
     }
     for (size_t i = 0; i < Count; ++i) {
         if constexpr (dr::is_jit_v<Float>) {
+            if (auto *known = DeviceScalars<Float>::find(values[i]->index())) {
+                out[i] = *known;
+                continue;
+            }
             dr::scalar_t<Float> number;
             jit_var_read(values[i]->index(), 0, &number);
             out[i] = (float) number;
@@ -174,12 +179,13 @@ private:
     }
 
     template <typename Values> static bool is_d65(const Values &values) {
-        if (dr::width(values) != MI_CIE_SAMPLES)
+        HostView host(values);
+        if (host.size() != MI_CIE_SAMPLES)
             return false;
-        float scale = scale_of_d65(values);
+        float scale = (float) host[0] / d65_value(0);
         for (size_t i = 1; i < MI_CIE_SAMPLES; ++i) {
             float expected = scale * d65_value(i);
-            if (std::abs((float) dr::slice(values, i) - expected) > 1e-5f * expected)
+            if (std::abs((float) host[i] - expected) > 1e-5f * expected)
                 return false;
         }
         return true;

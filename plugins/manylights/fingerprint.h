@@ -114,6 +114,9 @@ public:
         m_holds = true;
     }
 
+    /// JIT variants: the variables of all emitters and their shapes
+    const std::vector<uint32_t> &variables() const { return m_variables; }
+
     bool operator==(const Fingerprint &other) const {
         return same_places(other) && changed_emission(other).empty();
     }

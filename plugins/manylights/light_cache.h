@@ -145,6 +145,10 @@ private:
             !fingerprint.same_places(entry.fingerprint))
             return false;
         std::vector<uint32_t> changed = fingerprint.changed_emission(entry.fingerprint);
+        // Single ones are faster read where they are
+        std::vector<uint32_t> none;
+        DeviceScalars<Float> scalars(changed.size() < 100 ? none
+                                                          : fingerprint.variables());
         // Until it has succeeded they are the lights of no scene
         entry.fingerprint = Fingerprint<Float>(0);
         if (!entry.lights->refit(entry.scene, changed))
@@ -161,6 +165,7 @@ private:
         for (size_t i = 0; i < 2; ++i)
             if (m_entries[i] && m_entries[i]->scene == scene)
                 slot = i;
+        DeviceScalars<Float> scalars(fingerprint.variables());
         mitsuba::ref<Lights> lights = new Lights(scene, m_keep_binary);
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
         m_current = nullptr;

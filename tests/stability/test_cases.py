@@ -6,6 +6,7 @@ import pytest
 from scipy import stats
 
 from tests import statistics_tools as tools
+from tests.conftest import NO_INFINITY
 from tests.path_references import quick_and_slow
 from tests.references import reference_variant
 from tests.stability import samples
@@ -16,6 +17,8 @@ pytestmark = pytest.mark.usefixtures("plugin")
 
 def assert_mean(name, variant, images):
     """Compare images of a case with its reference."""
+    if name == "broken-triangles" and variant.startswith("cuda"):
+        pytest.skip(NO_INFINITY)
     tools.assert_finite(images, name)
     assert (images >= 0).all()
     if CASES[name].black:
