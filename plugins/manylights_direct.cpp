@@ -1,7 +1,7 @@
 #include <manylights/direct_light.h>
 #include <manylights/export_plugin.h>
 #include <manylights/hidden_emitters.h>
-#include <manylights/light_cache.h>
+#include <manylights/light_integrator.h>
 
 NAMESPACE_BEGIN(mitsuba)
 
@@ -38,6 +38,12 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
  * - hide_emitters
    - |bool|
    - Hide directly visible emitters. (Default: no, i.e. |false|)
+
+ * - learn_visibility
+   - |bool| or |string|
+   - Learn while rendering which lights can be seen from where, and prefer those. :code:`keep`
+     goes on with what was learnt in earlier renderings, until lights or shapes move or lights
+     are added. Method :code:`resampled_tree` only. (Default: no, i.e. |false|)
 
  * - method
    - |string|
@@ -104,12 +110,22 @@ all of them are kept. Environment maps, suns and directional lights always take 
 **It works well** wherever a few of many lights matter at each point, and the more so the more
 lights there are. **It works less well**
 
-- where most lights are hidden: the choice does not know about visibility (more
-  :code:`shadow_rays` help);
+- where most lights are hidden, unless :code:`learn_visibility` is set, see below;
 - on glossy surfaces that reflect few of many bright lights: raise :code:`splitting_rate` and
   :code:`reservoirs` together;
 - for very few lights, or lights of equal importance, where Mitsuba's :monosp:`direct` does
   the same with less arithmetic.
+
+**Learning visibility.** The image is rendered in passes. For each cell of space and each node
+of the tree, the shadow rays of the first passes are counted: those that were traced to lights
+below each of its children, and the share :math:`v` of them that arrived. Later passes weight
+:math:`h`, :math:`H` and :math:`g` by :math:`\max(\sqrt{v}, 0.1)`. All samples count in the image,
+which stays unbiased, and the same seed gives the same bits. The table takes at most 38 MB. Where
+the first pass shows that nothing can be gained, the others are rendered as usual. Nothing is
+learnt from a single sample per pixel, from an odd number of them in JIT variants, where all lights
+are considered anyway, and while differentiating; an integrator that is nested in others which
+only ask it for samples uses what it has kept, and learns nothing. What was kept is dropped with
+the integrator: load another one to start anew.
 
 Emitters of all kinds are supported. Point and spot lights and area lights on meshes, spheres,
 disks and cylinders are evaluated without virtual function calls, so that kernels do not grow
@@ -138,23 +154,17 @@ point (curves) are found by BSDF sampling alone.
  */
 
 template <typename Float, typename Spectrum>
-class ManyLightsDirect final : public SamplingIntegrator<Float, Spectrum> {
+using DirectBase = manylights::LightIntegrator<Float, Spectrum, SamplingIntegrator>;
+
+template <typename Float, typename Spectrum>
+class ManyLightsDirect final : public DirectBase<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(SamplingIntegrator, m_hide_emitters)
+    MI_IMPORT_BASE(DirectBase, m_hide_emitters, m_params, m_cache)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium, BSDF, BSDFPtr)
-    using Lights      = manylights::SceneLights<Float, Spectrum>;
     using DirectLight = manylights::DirectLight<Float, Spectrum>;
-    using Cache       = manylights::LightCache<Float, Spectrum>;
 
     ManyLightsDirect(const Properties &props)
-        : Base(props), m_params(manylights::read_parameters(props)),
-          m_cache(m_params.splits_nodes()) {}
-
-    TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
-                    bool evaluate) override {
-        typename Cache::Rendering guard(m_cache, scene);
-        return Base::render(scene, sensor, seed, spp, develop, evaluate);
-    }
+        : Base(props, manylights::read_parameters(props)) {}
 
     std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
                                      const RayDifferential3f &ray, const Medium *,
@@ -203,15 +213,6 @@ public:
         return { result, valid_ray };
     }
 
-    std::vector<std::string> aov_names() const override {
-        return manylights::count_channels(m_params);
-    }
-
-    void traverse(TraversalCallback *cb) override {
-        Base::traverse(cb);
-        m_cache.traverse(cb);
-    }
-
     std::string to_string() const override {
         std::ostringstream oss;
         oss << "ManyLightsDirect[" << std::endl
@@ -225,10 +226,6 @@ public:
     }
 
     MI_DECLARE_CLASS(ManyLightsDirect)
-
-private:
-    manylights::SamplingParameters m_params;
-    Cache m_cache;
 };
 
 MANYLIGHTS_EXPORT_PLUGIN(ManyLightsDirect)

@@ -1,5 +1,5 @@
 #include <manylights/export_plugin.h>
-#include <manylights/light_cache.h>
+#include <manylights/light_integrator.h>
 #include <manylights/path_tracer.h>
 
 NAMESPACE_BEGIN(mitsuba)
@@ -41,6 +41,12 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
    - |int|
    - Lights that are tested for visibility at the first vertex, 1 to :code:`reservoirs`; a
      quarter of it at later ones. (Default: 4)
+
+ * - learn_visibility
+   - |bool| or |string|
+   - Learn while rendering which lights can be seen from where, and prefer those. :code:`keep`
+     goes on with what was learnt in earlier renderings, until lights or shapes move or lights
+     are added. Method :code:`resampled_tree` only. (Default: no, i.e. |false|)
 
  * - method
    - |string|
@@ -111,7 +117,8 @@ densities: no weight exceeds the number of channels.
 - in heterogeneous media with lights inside: their single scattering is estimated at the
   distance of a random flight, and has fireflies around point lights;
 - in dense media, where lights are chosen as if the medium reached as far as the light;
-- where most lights are hidden, as in :monosp:`manylights_direct`.
+- where most lights are hidden, unless :code:`learn_visibility` is set, see
+  :monosp:`manylights_direct`.
 
 .. note:: Gradients of BSDFs, media and emitters flow through :code:`mi.render` in the
    :code:`ad` variants; positions of lights are not differentiated. In JIT variants this
@@ -134,22 +141,17 @@ densities: no weight exceeds the number of channels.
  */
 
 template <typename Float, typename Spectrum>
-class ManyLightsVolpath final : public MonteCarloIntegrator<Float, Spectrum> {
+using PathBase = manylights::LightIntegrator<Float, Spectrum, MonteCarloIntegrator>;
+
+template <typename Float, typename Spectrum>
+class ManyLightsVolpath final : public PathBase<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(MonteCarloIntegrator, m_max_depth, m_rr_depth, m_hide_emitters)
+    MI_IMPORT_BASE(PathBase, m_max_depth, m_rr_depth, m_hide_emitters, m_params, m_cache)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium)
-    using Cache      = manylights::LightCache<Float, Spectrum>;
     using PathTracer = manylights::PathTracer<Float, Spectrum>;
 
     ManyLightsVolpath(const Properties &props)
-        : Base(props), m_params(manylights::read_path_parameters(props)),
-          m_cache(m_params.splits_nodes()) {}
-
-    TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
-                    bool evaluate) override {
-        typename Cache::Rendering guard(m_cache, scene);
-        return Base::render(scene, sensor, seed, spp, develop, evaluate);
-    }
+        : Base(props, manylights::read_path_parameters(props)) {}
 
     std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
                                      const RayDifferential3f &ray, const Medium *medium,
@@ -168,15 +170,6 @@ public:
         return result;
     }
 
-    std::vector<std::string> aov_names() const override {
-        return manylights::count_channels(m_params);
-    }
-
-    void traverse(TraversalCallback *cb) override {
-        Base::traverse(cb);
-        m_cache.traverse(cb);
-    }
-
     std::string to_string() const override {
         std::ostringstream oss;
         oss << "ManyLightsVolpath[" << std::endl
@@ -191,10 +184,6 @@ public:
     }
 
     MI_DECLARE_CLASS(ManyLightsVolpath)
-
-private:
-    manylights::SamplingParameters m_params;
-    Cache m_cache;
 };
 
 MANYLIGHTS_EXPORT_PLUGIN(ManyLightsVolpath)

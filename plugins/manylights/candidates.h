@@ -29,6 +29,8 @@ template <typename Float> struct Candidate {
     UInt32 light;
     Float probability;
     Mask valid;
+    /// Factor of H and of the targets of stage 3
+    Float visibility = Float(1.f);
 };
 
 /// Largest float below 1
@@ -78,7 +80,9 @@ template <typename Float> struct SystematicCursor {
     struct Place {
         UInt32 node;
         Float begin, width;
-        DRJIT_STRUCT(Place, node, begin, width)
+        /// Learnt for the place, or for one above it
+        Float visibility;
+        DRJIT_STRUCT(Place, node, begin, width, visibility)
     };
 
     /// Expected candidates K, offset u of the points, next point k
@@ -125,11 +129,14 @@ template <typename Float> struct SystematicCursor {
         Mask same =
             d.place.node == last_leaf; // two points on the same border, by rounding
         last_leaf = d.place.node;
-        return { d.place.node & ~kLeafBit, dr::minimum(1.f, d.place.width), !same };
+        return { d.place.node & ~kLeafBit, dr::minimum(1.f, d.place.width), !same,
+                 d.place.visibility };
     }
 
 private:
-    static Place root(const Float &width) { return { UInt32(0), Float(0.f), width }; }
+    static Place root(const Float &width) {
+        return { UInt32(0), Float(0.f), width, Float(1.f) };
+    }
 
     /// Does point k, which is not in front of a place, lie in its interval?
     Mask holds(const Place &place, const Float &k) const {
@@ -145,12 +152,16 @@ private:
     void descend(const TreeView<Float> &tree, const Receiver<Float> &at,
                  Descent &s) const {
         WideNodeView<Float> node(tree, s.place.node, true);
-        ChildWeights<Float> weights = child_weights(tree, at, node.clusters);
-        Float x                     = s.x * weights.total();
-        ChildChoice<Float> choice   = choose_child(weights, node.child, x);
-        Float scale                 = s.place.width / weights.total();
+        ChildVisibility<Float> visibility = tree.child_visibility(at, s.place.node);
+        ChildWeights<Float> weights       = child_weights(
+            tree, at, node.clusters, tree.visibility ? &visibility : nullptr);
+        Float x                   = s.x * weights.total();
+        ChildChoice<Float> choice = choose_child(weights, node.child, x);
+        Float scale               = s.place.width / weights.total();
         Place child{ choice.child, dr::fmadd(choice.begin, scale, s.place.begin),
-                     choice.weight * scale };
+                     choice.weight * scale, s.place.visibility };
+        if (tree.visibility)
+            child.visibility = visibility.factor(choice.slot, s.place.visibility);
 
         // Remember this node if it holds a point beyond the child (the root needs no place)
         Mask push =

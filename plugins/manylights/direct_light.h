@@ -52,10 +52,11 @@ public:
     DirectLight(const Scene *scene, const Lights &lights,
                 const SamplingParameters &params, const MediaKinds &media = {})
         : m_scene(scene), m_lights(lights), m_emission(scene, lights),
-          m_media(scene, media), m_params(params) {
+          m_media(scene, media), m_params(params),
+          m_learns(lights.tree().visibility != nullptr) {
         uint32_t count = lights.tree().light_count;
         // N <= m: no tree, every light is a candidate
-        m_all      = count <= params.reservoirs || params.visits_all();
+        m_all      = params.considers_all(count);
         float most = m_all ? (float) count : params.most_candidates();
         m_keep_all = most <= (float) params.reservoirs;
         m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
@@ -80,14 +81,17 @@ public:
     Vertex prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
                    const typename Vertex::InMedium *inside, const LightSample<Float> &u,
                    const MaskD &first, Mask active) const {
-        return { si,
-                 bsdf,
-                 inside,
-                 u,
-                 effort(first),
-                 m_lights.glossy() && !m_all,
-                 Extent::Point,
-                 active };
+        Vertex vertex{ si,
+                       bsdf,
+                       inside,
+                       u,
+                       effort(first),
+                       m_lights.glossy() && !m_all,
+                       Extent::Point,
+                       active };
+        if (m_learns)
+            vertex.at.cell = cell(vertex);
+        return vertex;
     }
 
     /// All of a segment in a homogeneous medium
@@ -95,8 +99,11 @@ public:
                            const typename Vertex::InMedium &inside,
                            const LightSample<Float> &u, const MaskD &first,
                            Mask active) const {
-        return { behind,        no_bsdf, &inside,         u,
-                 effort(first), false,   Extent::Segment, active };
+        Vertex vertex{ behind,        no_bsdf, &inside,         u,
+                       effort(first), false,   Extent::Segment, active };
+        if (m_learns)
+            vertex.at.cell = cell(vertex);
+        return vertex;
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
@@ -274,6 +281,7 @@ private:
                 if (m_choose) {
                     FloatD g =
                         light_target(vertex, candidate.light, p, s.slot, active && valid);
+                    g *= candidate.visibility;
                     write_slot<FloatD>(kept.target, s.slot, weight * g, m_items, valid);
                 }
                 s.slot += dr::select(valid, UInt32D(1), UInt32D(0));
@@ -306,7 +314,8 @@ private:
             state, [&](const State &s) { return on && s.cursor.has_next(); },
             [&](State &s) {
                 auto candidate = s.cursor.next(tree, at, s.rng);
-                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds);
+                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds) *
+                           candidate.visibility;
                 s.reservoirs.add(candidate, h, m_slots, dealing, s.rng);
                 s.candidates += 1u;
             },
@@ -341,6 +350,7 @@ private:
                     light_target(vertex, read_slot<UInt32D>(kept.light, s.slot, m_slots),
                                  read_slot<FloatD>(kept.probability, s.slot, m_slots),
                                  s.slot, active && weight > 0.f);
+                target *= read_slot<FloatD>(reservoirs.visibility, s.slot, m_slots);
                 write_slot<FloatD>(s.target, s.slot, weight * target, m_items, true);
                 s.slot += 1u;
             },
@@ -492,7 +502,27 @@ private:
             sample = dr::select(active && chosen.item == (uint32_t) (m_slots + i),
                                 infinite[i], sample);
 
-        return trace_sample(vertex, sample, rng, active);
+        Spectrum result = trace_sample(vertex, sample, rng, active);
+        if (m_learns) {
+            // Far from the smallest floats, which some threads round to zero
+            constexpr float least = 1e-30f;
+            MaskD traced = plain(active) && chosen.item < m_slots &&
+                           Reader::target(sample.value) > least;
+            UInt32D slot = dr::minimum(chosen.item, m_slots - 1u);
+            count_ray(m_lights.tree(), vertex.at.cell,
+                      read_slot<UInt32D>(kept.light, slot, m_slots),
+                      Reader::target(result) > least, traced);
+        }
+        return result;
+    }
+
+    /// Where visibility is learnt and looked up, see \ref VisibilityTable::cell
+    UInt32D cell(const Vertex &vertex) const {
+        auto u    = plain_sample(vertex.u);
+        auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
+        return m_lights.tree().visibility->cell(
+            vertex.at, bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
+            bits(u.point.y()) + bits(u.selection));
     }
 
     Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,
@@ -769,6 +799,8 @@ private:
     const SamplingParameters &m_params;
     /// Is every light a candidate? Is every candidate kept? Are there more than shadow rays?
     bool m_all, m_keep_all, m_choose;
+    /// Is something known of the lights' visibility, or to be learnt?
+    bool m_learns;
     /// Places for kept lights, and these together with the lights at infinity
     uint32_t m_slots, m_items;
 };

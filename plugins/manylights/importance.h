@@ -40,9 +40,11 @@ template <typename Float> struct Receiver {
     Float extinction;
     /// A segment from p along -wi of this length (0: a point), and where a path went on
     Float length, distance;
+    /// Where visibility is learnt (visibility.h)
+    dr::uint32_array_t<Float> cell;
 
     DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, in_medium,
-                 extinction, length, distance)
+                 extinction, length, distance, cell)
 
     /// Which of the above are in use, the same for all receivers of a rendering: the lobe
     /// and the medium. What is not costs nothing.

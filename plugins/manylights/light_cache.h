@@ -57,6 +57,8 @@ public:
         }
         Rendering(const Rendering &) = delete;
 
+        Lights &lights() const { return *m_entry->lights; }
+
     private:
         const LightCache &m_cache;
         Entry *m_entry;

@@ -12,6 +12,7 @@
 
 #include "importance.h"
 #include "tree_builder.h"
+#include "visibility.h"
 #include <drjit/dynamic.h>
 
 namespace manylights {
@@ -36,6 +37,8 @@ template <typename Float> struct TreeView {
     uint32_t light_count = 0;
     KindSet kinds;
     Directions directions = Directions::All;
+    /// What has been learnt of the lights' visibility, null if that is not wanted
+    const VisibilityTable<Float> *visibility = nullptr;
 
     /// Gather the `Count` floats of entry `index`
     template <size_t Count>
@@ -52,6 +55,13 @@ template <typename Float> struct TreeView {
             return dr::gather<UInt32>(node_links, node);
         else
             return node_links.data()[node];
+    }
+
+    /// What has been learnt of a wide node, if anything is learnt at all
+    ChildVisibility<Float> child_visibility(const Receiver &at,
+                                            const UInt32 &node) const {
+        return visibility ? visibility->children(at.cell, node)
+                          : ChildVisibility<Float>{ UInt32(0) };
     }
 
     Row<Float> row(const UInt32 &light, const Mask &active = true) const {
@@ -120,7 +130,8 @@ template <typename Float> struct ChildWeights {
  */
 template <typename Float>
 ChildWeights<Float> child_weights(const TreeView<Float> &tree, const Receiver<Float> &at,
-                                  const Clusters<Float> &clusters) {
+                                  const Clusters<Float> &clusters,
+                                  const ChildVisibility<Float> *visibility = nullptr) {
     Four<Float> h = cluster_importance(at, clusters, tree.directions);
     Float sum     = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     /* On top of a light h overflows, very far away it vanishes: then the flux alone decides.
@@ -136,6 +147,8 @@ ChildWeights<Float> child_weights(const TreeView<Float> &tree, const Receiver<Fl
         usable, sum * scale * (kDefensiveShare / (1.f - kDefensiveShare)), Float(1.f));
     Four<Float> weight =
         dr::fmadd(clusters.flux, Four<Float>(share), dr::select(usable, h * scale, 0.f));
+    if (visibility)
+        weight *= visibility->factors();
     ChildWeights<Float> result;
     Float end(0.f);
     for (size_t i = 0; i < 4; ++i) {
@@ -148,7 +161,7 @@ ChildWeights<Float> child_weights(const TreeView<Float> &tree, const Receiver<Fl
 
 /// The child on which a number falls
 template <typename Float> struct ChildChoice {
-    dr::uint32_array_t<Float> child;
+    dr::uint32_array_t<Float> child, slot;
     Float begin, weight;
 };
 
@@ -158,10 +171,12 @@ template <typename Float>
 ChildChoice<Float> choose_child(const ChildWeights<Float> &weights,
                                 const dr::Array<dr::uint32_array_t<Float>, 4> &child,
                                 const Float &x) {
-    ChildChoice<Float> choice{ child.entry(0), Float(0.f), weights.weight.entry(0) };
+    using UInt32 = dr::uint32_array_t<Float>;
+    ChildChoice<Float> choice{ child.entry(0), 0u, Float(0.f), weights.weight.entry(0) };
     for (size_t i = 1; i < 4; ++i) {
         auto take     = x >= weights.end.entry(i - 1);
         choice.child  = dr::select(take, child.entry(i), choice.child);
+        choice.slot   = dr::select(take, UInt32((uint32_t) i), choice.slot);
         choice.begin  = dr::select(take, weights.end.entry(i - 1), choice.begin);
         choice.weight = dr::select(take, weights.weight.entry(i), choice.weight);
     }
@@ -188,7 +203,9 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
         [&](State &s) {
             UInt32 index = s.link >> 2u, slot = s.link & 3u;
             WideNodeView<Float> node(tree, index, true);
-            auto weights = child_weights(tree, at, node.clusters);
+            ChildVisibility<Float> visibility = tree.child_visibility(at, index);
+            auto weights = child_weights(tree, at, node.clusters,
+                                         tree.visibility ? &visibility : nullptr);
             Float w      = weights.weight.entry(0);
             for (uint32_t i = 1; i < 4; ++i)
                 w = dr::select(slot == i, weights.weight.entry(i), w);
@@ -197,6 +214,30 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
         },
         "Light tree: probability of a leaf");
     return state.probability;
+}
+
+/// Count a shadow ray to `light` in the records of all nodes above it
+template <typename Float>
+void count_ray(const TreeView<Float> &tree, const dr::uint32_array_t<Float> &cell,
+               const dr::uint32_array_t<Float> &light, const dr::mask_t<Float> &arrived,
+               const dr::mask_t<Float> &traced) {
+    using UInt32 = dr::uint32_array_t<Float>;
+    struct State {
+        UInt32 link;
+        DRJIT_STRUCT(State, link)
+    };
+
+    auto active = traced && tree.visibility->counting();
+    UInt32 link = tree.row(light, active).bits(kLink);
+    State state{ dr::select(active, link, kNone) };
+    loop(
+        state, [](const State &s) { return s.link != kNone; },
+        [&](State &s) {
+            UInt32 node = s.link >> 2u;
+            tree.visibility->count(cell, node, s.link & 3u, arrived, s.link != kNone);
+            s.link = tree.parent_link(node);
+        },
+        "Light tree: visibility");
 }
 
 } // namespace manylights

@@ -51,9 +51,28 @@ size_t read_choice(const Properties &props, const std::string &name,
     refuse(props, name, "\"" + value + "\"", allowed);
 }
 
-const std::vector<std::string> kMethods = { "resampled_tree", "talk",
-                                            "adaptive_splitting", "tree", "exhaustive" };
+const std::vector<std::string> kMethods  = { "resampled_tree", "talk",
+                                             "adaptive_splitting", "tree", "exhaustive" };
+const std::vector<std::string> kLearning = { "false", "true", "keep" };
 const std::vector<std::string> kSplitFunctions = { "near", "far" };
+
+/// Learning is part of the default method
+LearnVisibility read_learning(const Properties &props, Method method) {
+    const std::string name = "learn_visibility";
+    if (method != Method::ResampledTree) {
+        if (props.has_property(name))
+            refuse(props, name, "given",
+                   "left out unless \"method\" is \"" + kMethods[0] + "\"");
+        return LearnVisibility::No;
+    }
+    if (props.has_property(name) && props.type(name) == Properties::Type::String) {
+        std::string text = props.get<std::string>(name);
+        if (text != "keep")
+            refuse(props, name, "\"" + text + "\"", "a boolean or \"keep\"");
+        return LearnVisibility::Keep;
+    }
+    return props.get<bool>(name, false) ? LearnVisibility::Yes : LearnVisibility::No;
+}
 
 /// Parameters that would have no effect are mistakes
 void refuse_unused(const Properties &props, const SamplingParameters &p) {
@@ -86,7 +105,8 @@ SamplingParameters read_light_parameters(const Properties &props) {
                                   std::min(p.shadow_rays, p.reservoirs), 1, p.reservoirs);
     p.split_function =
         (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
-    p.counts = props.get<bool>("counts", false);
+    p.counts           = props.get<bool>("counts", false);
+    p.learn_visibility = read_learning(props, p.method);
     refuse_unused(props, p);
     if (p.method == Method::Exhaustive)
         p.splitting_rate = std::numeric_limits<float>::infinity();
@@ -127,6 +147,8 @@ std::string to_string(const SamplingParameters &p) {
         oss << ",\nsplitting_rate = " << p.splitting_rate;
     if (p.method != Method::Tree && !p.traces_all())
         oss << ",\nreservoirs = " << p.reservoirs << ",\nshadow_rays = " << p.shadow_rays;
+    if (p.method == Method::ResampledTree)
+        oss << ",\nlearn_visibility = " << kLearning[(size_t) p.learn_visibility];
     oss << ",\ncounts = " << (p.counts ? "true" : "false");
     return oss.str();
 }

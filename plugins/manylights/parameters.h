@@ -16,6 +16,9 @@ namespace manylights {
 /// Where candidates come from, and what becomes of them
 enum class Method { ResampledTree, Talk, AdaptiveSplitting, Tree, Exhaustive };
 
+/// Is the lights' visibility learnt in each rendering, and is it kept for the next one?
+enum class LearnVisibility { No, Yes, Keep };
+
 /// See the documentation of the plugin manylights_direct
 struct SamplingParameters {
     Method method                = Method::ResampledTree;
@@ -25,7 +28,8 @@ struct SamplingParameters {
     /// What the vertices of a path after its first one get of candidates and shadow rays
     float deeper_candidates = 1.f, deeper_rays = 1.f;
     /// Are the candidates and the visited nodes counted, in film channels?
-    bool counts = false;
+    bool counts                      = false;
+    LearnVisibility learn_visibility = LearnVisibility::No;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
@@ -49,8 +53,10 @@ struct SamplingParameters {
     }
     /// Does each candidate get a shadow ray?
     bool traces_all() const { return method == Method::AdaptiveSplitting; }
-    /// Is K so large that every light is visited?
-    bool visits_all() const { return expected_candidates() > kMaxExpectedCandidates; }
+    /// Is every one of so many lights a candidate, without a tree?
+    bool considers_all(uint32_t lights) const {
+        return lights <= reservoirs || expected_candidates() > kMaxExpectedCandidates;
+    }
 };
 
 /// Read and check the parameters; throws with the name, the value and what is allowed

@@ -56,13 +56,15 @@ template <typename Float> struct Reservoirs {
     /// H and inclusion probability of the light that it holds, and the light
     Slots<Float> importance, probability;
     Slots<UInt32> light;
-    DRJIT_STRUCT(Reservoirs, weight, importance, probability, light)
+    Slots<Float> visibility;
+    DRJIT_STRUCT(Reservoirs, weight, importance, probability, light, visibility)
 
     explicit Reservoirs(size_t count)
         : weight(make_slots<Float>(count, 0.f)),
           importance(make_slots<Float>(count, 1.f)),
           probability(make_slots<Float>(count, 1.f)),
-          light(make_slots<UInt32>(count, 0u)) {}
+          light(make_slots<UInt32>(count, 0u)),
+          visibility(make_slots<Float>(count, 1.f)) {}
 
     /// Deal a candidate of importance H; weights that are not positive and finite are ignored
     template <typename Rng>
@@ -81,6 +83,7 @@ template <typename Float> struct Reservoirs {
         write_slot<Float>(importance, k, h, count, take);
         write_slot<Float>(probability, k, candidate.probability, count, take);
         write_slot<UInt32>(light, k, candidate.light, count, take);
+        write_slot<Float>(visibility, k, candidate.visibility, count, take);
     }
 
 private:

@@ -186,6 +186,48 @@ public:
     }
 
     const Tree &tree() const { return m_tree; }
+
+    /**
+     * Learn the lights' visibility from now on: anew, or in addition to what was kept if the
+     * shapes are still the same. The table has 512 records for each node, about as many as
+     * there are cells in sight, but no more than samples are expected, and at most 38 MB.
+     */
+    void start_learning(const Scene *scene, const CellSize &size, double samples,
+                        bool keep) {
+        Fingerprint<Float> shapes(0);
+        if (keep)
+            for (const auto &shape : scene->shapes())
+                shapes.add_emitter(shape.get());
+        if (!keep || !m_visibility || !shapes.same_places(m_learnt_shapes)) {
+            double wanted    = std::min(512. * m_statistics.nodes, samples);
+            uint32_t records = 1u << 12;
+            while (records < kMostRecords && records < wanted)
+                records *= 2;
+            m_visibility    = std::make_unique<VisibilityTable<FloatD>>(records, size);
+            m_learnt_shapes = std::move(shapes);
+            m_learnt_shapes.hold();
+        }
+        m_visibility->set_counting(true);
+        m_tree.visibility = m_visibility.get();
+    }
+
+    /// Use what was learnt so far, if it is worth it, and learn on if so wanted
+    void learn(bool go_on) {
+        if (!m_tree.visibility)
+            return;
+        if (m_visibility->learn() < kLeastGain)
+            m_tree.visibility = nullptr;
+        m_visibility->set_counting(go_on);
+    }
+
+    void stop_learning(bool keep) {
+        m_visibility->set_counting(false);
+        if (keep)
+            return;
+        m_tree.visibility = nullptr;
+        m_visibility.reset();
+    }
+
     /// Has any surface a glossy lobe?
     bool glossy() const { return m_glossy; }
     /// Kinds of light that are sampled from the table
@@ -358,6 +400,9 @@ private:
     }
 
     Tree m_tree;
+    std::unique_ptr<VisibilityTable<FloatD>> m_visibility;
+    Fingerprint<Float> m_learnt_shapes{ 0 };
+    static constexpr uint32_t kMostRecords = 1u << 20;
     IndexStorage m_light_of_primitive, m_shape_lights;
     std::unordered_map<const Shape *, ShapeLights<Shape>> m_shape_map;
     /// See HostTable; for each emitter of the scene

@@ -1,0 +1,249 @@
+"""Visibility learnt while rendering: the same mean, less noise, and the same bits every time."""
+
+import drjit as dr
+import manylights
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import stats
+
+from tests import statistics_tools as tools
+from tests.path_references import quick_and_slow
+from tests.statistics_tools import SIGNIFICANCE
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
+INTEGRATORS = {
+    "direct": {"type": "manylights_direct"},
+    "paths": {"type": "manylights_volpath", "max_depth": 3},
+}
+#: Enough samples for several passes in LLVM variants, whose passes are not arbitrarily small.
+#: Enough pixels for scalar ones, where the size of blocks depends on the number of threads.
+SIZE = {"width": 96, "height": 64, "spp": 64}
+
+
+def hidden_points(fog=False):
+    """299 point lights behind a wall, 3 in front of it, in clear air or in fog."""
+    scene = manylights.scenes.behind_wall(302, **SIZE)
+    if fog:
+        medium = {"type": "homogeneous", "sigma_t": 0.05, "albedo": 0.8}
+        scene["fog"] = {
+            "type": "sphere",
+            "radius": 40.0,
+            "bsdf": {"type": "null"},
+            "interior": {"type": "ref", "id": "air"},
+        }
+        scene = {"type": "scene", "air": medium, **scene}
+        scene["sensor"]["medium"] = {"type": "ref", "id": "air"}
+    return scene
+
+
+def hidden_lamps():
+    """Lamps with a surface behind a wall, and a few in front: BSDF samples hit some of them."""
+    scene = manylights.scenes.behind_wall(1, **SIZE)
+    rng = np.random.default_rng(1)
+    front = rng.uniform([-3.0, -2.0, 2.0], [2.0, 2.0, 3.0], (4, 3))
+    back = rng.uniform([-4.0, 3.3, 1.0], [3.0, 4.5, 3.0], (76, 3))
+    corners = np.concatenate([front, back])[:, None] + np.array(
+        [[0.0, 0.0, 0.0], [0.0, 0.7, 0.0], [0.7, 0.7, 0.0], [0.7, 0.0, 0.0]]
+    )
+    lamps = mi.Mesh("lamps", 4 * len(corners), 2 * len(corners), props=lamp_properties())
+    params = mi.traverse(lamps)
+    first = 4 * np.arange(len(corners))[:, None]
+    params["vertex_positions"] = corners.ravel()
+    params["faces"] = (first + np.array([[0, 1, 2, 0, 2, 3]])).ravel()
+    params.update()
+    return {**scene, "lamps": lamps}
+
+
+def lamp_properties():
+    """The emission of all lamps."""
+    props = mi.Properties()
+    props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 2.0}})
+    return props
+
+
+SCENES = {"points": hidden_points, "fog": lambda: hidden_points(fog=True), "lamps": hidden_lamps}
+
+
+def integrator(kind="direct", **parameters):
+    """An integrator that learns, unless it is told otherwise."""
+    props = {**INTEGRATORS[kind], "learn_visibility": True, **parameters}
+    return mi.load_dict({name: value for name, value in props.items() if value is not None})
+
+
+def render(scene, method, seed=0, spp=32):
+    """An image as an array."""
+    return np.array(mi.render(scene, integrator=method, seed=seed, spp=spp))
+
+
+def images(scene, method, seeds=range(12)):
+    """Images of several seeds."""
+    return np.stack([render(scene, method, seed) for seed in seeds])
+
+
+CASES = [f"{name}-{kind}" for name in SCENES for kind in INTEGRATORS]
+CASES.remove("fog-direct")  # it knows no media
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("case", quick_and_slow(CASES, ["points-direct", "lamps-paths"]))
+def test_unbiased(variant, case):
+    """Learning, what was learnt before, and all lights at each point have the same mean."""
+    name, kind = case.split("-")
+    scene = mi.load_dict(SCENES[name]())
+    every = {"method": "exhaustive", "learn_visibility": None}
+    reference = integrator(kind, **every) if kind == "direct" else None
+    reference = reference or integrator(kind, learn_visibility=False, splitting_rate=6)
+    expected = images(scene, reference, range(100, 112))
+    tools.assert_same_mean(images(scene, integrator(kind)), expected, label=f"{case}, learning")
+    kept = integrator(kind, learn_visibility="keep")
+    render(scene, kept, seed=99)
+    tools.assert_same_mean(images(scene, kept), expected, label=f"{case}, kept")
+
+
+def test_bias_is_noticed(llvm):
+    """A bias of 2 % in the light that arrives fails the comparison above."""
+    scene = mi.load_dict(hidden_points())
+    learnt = images(scene, integrator())
+    plain = images(scene, integrator(learn_visibility=False), range(100, 112))
+    with pytest.raises(AssertionError):
+        tools.assert_same_mean(1.02 * learnt, plain)
+
+
+def variances(values):
+    """Variance of each pixel over the seeds, relative to the image's mean."""
+    return values.var(axis=0, ddof=1).mean(axis=-1) / values.mean() ** 2
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("kind", INTEGRATORS)
+def test_less_noise_where_lights_are_hidden(variant, kind):
+    """Pixels have less variance with learning; without hidden lights they have not."""
+    scene = mi.load_dict(hidden_points())
+    learnt = variances(images(scene, integrator(kind)))
+    plain = variances(images(scene, integrator(kind, learn_visibility=False), range(100, 112)))
+    test = stats.wilcoxon(learnt.ravel(), plain.ravel(), alternative="less")
+    assert test.pvalue < SIGNIFICANCE
+    other = variances(images(scene, integrator(kind, learn_visibility=False), range(200, 212)))
+    same = stats.wilcoxon(other.ravel(), plain.ravel(), alternative="less")
+    assert same.pvalue > SIGNIFICANCE
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("kind", INTEGRATORS)
+def test_same_seed_same_bits(variant, kind, thread_count):
+    """For any number of threads, any integrator object, and after other renderings."""
+    scene = mi.load_dict(hidden_points())
+    method = integrator(kind)
+    thread_count(1)
+    expected = render(scene, method)
+    thread_count(3)
+    assert np.array_equal(expected, render(scene, method))
+    thread_count(2)
+    assert not np.array_equal(expected, render(scene, method, seed=1))
+    assert np.array_equal(expected, render(scene, integrator(kind)))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_what_is_kept_is_used(variant):
+    """A later image has less noise than the first, and depends on what was learnt."""
+    scene = mi.load_dict(hidden_points())
+    first, second = [], []
+    for seed in range(12):
+        kept = integrator(learn_visibility="keep")
+        first.append(render(scene, kept, seed, spp=16))
+        second.append(render(scene, kept, seed + 100, spp=16))
+    first, second = variances(np.stack(first)), variances(np.stack(second))
+    test = stats.wilcoxon(second.ravel(), first.ravel(), alternative="less")
+    assert test.pvalue < SIGNIFICANCE
+
+
+CHANGES = {
+    "a wall": ("wall.vertex_positions", lambda x: x + 0.25, True),
+    "a light": ("light_0.position", lambda x: x + 0.25, True),
+    "an intensity": ("light_0.intensity.value", lambda x: x * 1.5, False),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_is_kept_is_dropped_when_something_moves(variant, change):
+    """Then the next image is that of an integrator that has learnt nothing."""
+    key, function, drops = CHANGES[change]
+    scene = mi.load_dict(hidden_points())
+    kept = integrator(learn_visibility="keep")
+    render(scene, kept)
+    params = mi.traverse(scene)
+    params[key] = type(params[key])(function(params[key]))
+    params.update()
+    fresh = render(scene, integrator(learn_visibility="keep"), seed=5)
+    assert np.array_equal(render(scene, kept, seed=5), fresh) == drops
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("spp", [1, 7, 37])
+def test_numbers_of_samples(variant, spp):
+    """One sample, or a number that is hard to divide, is rendered as well."""
+    scene = mi.load_dict(hidden_points())
+    image = render(scene, integrator(), spp=spp)
+    assert np.isfinite(image).all()
+    if spp == 1:
+        assert np.array_equal(image, render(scene, integrator(learn_visibility=False), spp=spp))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_few_lights_need_no_visibility(variant):
+    """Where every light is looked at, there is one pass, and nothing is learnt."""
+    scene = mi.load_dict(manylights.scenes.behind_wall(8, **SIZE))
+    off = integrator(learn_visibility=False)
+    assert np.array_equal(render(scene, integrator()), render(scene, off))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_other_integrators_read_only(variant):
+    """`moment` asks for samples only: nothing is learnt, nothing changes."""
+    scene = mi.load_dict(hidden_points())
+
+    def within_moment(learn):
+        nested = {"type": "manylights_direct", "learn_visibility": learn}
+        return mi.load_dict({"type": "moment", "image": nested})
+
+    assert np.array_equal(
+        render(scene, within_moment(True), spp=8), render(scene, within_moment(False), spp=8)
+    )
+
+
+def test_gradients_are_those_without_learning(llvm):
+    """Differentiation records one pass."""
+    scene = mi.load_dict(hidden_points())
+    gradients = []
+    for learn in (False, True):
+        params = mi.traverse(scene)
+        key = next(name for name, _ in params if name.endswith("reflectance.value"))
+        dr.enable_grad(params[key])
+        image = mi.render(
+            scene, params, integrator=integrator(learn_visibility=learn), spp=16, seed_grad=3
+        )
+        dr.backward(dr.mean(image, axis=None))
+        gradients.append(np.array(dr.grad(params[key])))
+        dr.disable_grad(params[key])
+    # Sums over samples are made in no fixed order
+    np.testing.assert_allclose(*gradients, rtol=1e-5)
+    assert gradients[0].any()
+
+
+@pytest.mark.parametrize("kind", INTEGRATORS)
+def test_bad_values_are_named(llvm, kind):
+    """The message tells the parameter, its value and what is allowed."""
+    with pytest.raises(RuntimeError, match='learn_visibility.*"always".*boolean or "keep"'):
+        integrator(kind, learn_visibility="always")
+    with pytest.raises(RuntimeError, match="learn_visibility.*resampled_tree"):
+        integrator(kind, method="talk")
+
+
+def test_described(llvm):
+    """`to_string` tells the value."""
+    assert "learn_visibility = keep" in str(integrator(learn_visibility="keep"))
+    assert "learn_visibility = false" in str(mi.load_dict({"type": "manylights_direct"}))
