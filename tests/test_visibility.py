@@ -237,9 +237,9 @@ def test_gradients_are_those_without_learning(llvm):
 @pytest.mark.parametrize("kind", INTEGRATORS)
 def test_bad_values_are_named(llvm, kind):
     """The message tells the parameter, its value and what is allowed."""
-    with pytest.raises(RuntimeError, match='learn_visibility.*"always".*boolean or "keep"'):
+    with pytest.raises(RuntimeError, match=r'learn_visibility.*"always".*boolean or "keep"'):
         integrator(kind, learn_visibility="always")
-    with pytest.raises(RuntimeError, match="learn_visibility.*resampled_tree"):
+    with pytest.raises(RuntimeError, match=r"learn_visibility.*resampled_tree"):
         integrator(kind, method="talk")
 
 
