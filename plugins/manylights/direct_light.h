@@ -506,9 +506,9 @@ private:
         if (m_learns) {
             // Far from the smallest floats, which some threads round to zero
             constexpr float least = 1e-30f;
-            MaskD traced = plain(active) && chosen.item < m_slots &&
-                           Reader::target(sample.value) > least;
-            UInt32D slot = dr::minimum(chosen.item, m_slots - 1u);
+            MaskD traced          = plain(active) && chosen.item < m_slots &&
+                                    Reader::target(sample.value) > least;
+            UInt32D slot          = dr::minimum(chosen.item, m_slots - 1u);
             count_ray(m_lights.tree(), vertex.at.cell,
                       read_slot<UInt32D>(kept.light, slot, m_slots),
                       Reader::target(result) > least, traced);

@@ -113,7 +113,8 @@ private:
               m_size(film_size(sensor->film())) {
             const SamplingParameters &params = integrator.m_params;
             if (params.learn_visibility == LearnVisibility::No || integrator.m_learning ||
-                integrator.m_differentiating || integrator.m_samples_per_pass != kOnePass ||
+                integrator.m_differentiating ||
+                integrator.m_samples_per_pass != kOnePass ||
                 params.considers_all(lights.tree().light_count))
                 return;
             Sampler *sampler = sensor->sampler();
