@@ -1,5 +1,7 @@
 """Visibility learnt while rendering: the same mean, less noise, and the same bits every time."""
 
+import threading
+
 import drjit as dr
 import manylights
 import mitsuba as mi
@@ -8,6 +10,7 @@ import pytest
 from scipy import stats
 
 from tests import statistics_tools as tools
+from tests.conftest import BACKEND
 from tests.path_references import quick_and_slow
 from tests.statistics_tools import SIGNIFICANCE
 
@@ -21,6 +24,8 @@ INTEGRATORS = {
 #: Enough samples for several passes in LLVM variants, whose passes are not arbitrarily small.
 #: Enough pixels for scalar ones, where the size of blocks depends on the number of threads.
 SIZE = {"width": 96, "height": 64, "spp": 64}
+if BACKEND == "cuda":
+    SIZE |= {"width": 960, "height": 640}
 
 
 def hidden_points(fog=False):
@@ -144,6 +149,24 @@ def test_same_seed_same_bits(variant, kind, thread_count):
     thread_count(2)
     assert not np.array_equal(expected, render(scene, method, seed=1))
     assert np.array_equal(expected, render(scene, integrator(kind)))
+
+
+def test_overlapping_renderings(scalar):
+    """Two threads get the images that they get one after the other."""
+    scenes = [mi.load_dict(hidden_points()) for _ in range(2)]
+    method = integrator()
+    expected = [render(scene, method, seed=3) for scene in scenes]
+    found = [None, None]
+
+    def run(index):
+        found[index] = render(scenes[index], method, seed=3)
+
+    threads = [threading.Thread(target=run, args=(index,)) for index in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=120)
+    assert np.array_equal(found, expected)
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
