@@ -24,6 +24,7 @@ from manylights.scenes._adversarial import (
 from manylights.scenes._city import city
 from manylights.scenes._fog import fog_open, fog_rooms, fog_street
 from manylights.scenes._gallery import bulbs, glossy, open_plane, rooms
+from manylights.scenes._house import house
 
 __all__ = [
     "behind_wall",
@@ -36,6 +37,7 @@ __all__ = [
     "fog_rooms",
     "fog_street",
     "glossy",
+    "house",
     "names",
     "narrow_spots",
     "on_emitter",
