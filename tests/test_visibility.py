@@ -88,6 +88,11 @@ def images(scene, method, seeds=range(12)):
     return np.stack([render(scene, method, seed) for seed in seeds])
 
 
+#: What an integrator is compared with: every light at each point, or many without learning.
+REFERENCES = {
+    "direct": {"method": "exhaustive", "learn_visibility": None},
+    "paths": {"splitting_rate": 6, "learn_visibility": False},
+}
 CASES = [f"{name}-{kind}" for name in SCENES for kind in INTEGRATORS]
 CASES.remove("fog-direct")  # it knows no media
 
@@ -98,10 +103,7 @@ def test_unbiased(variant, case):
     """Learning, what was learnt before, and all lights at each point have the same mean."""
     name, kind = case.split("-")
     scene = mi.load_dict(SCENES[name]())
-    every = {"method": "exhaustive", "learn_visibility": None}
-    reference = integrator(kind, **every) if kind == "direct" else None
-    reference = reference or integrator(kind, learn_visibility=False, splitting_rate=6)
-    expected = images(scene, reference, range(100, 112))
+    expected = images(scene, integrator(kind, **REFERENCES[kind]), range(100, 112))
     tools.assert_same_mean(images(scene, integrator(kind)), expected, label=f"{case}, learning")
     kept = integrator(kind, learn_visibility="keep")
     render(scene, kept, seed=99)

@@ -152,16 +152,15 @@ private:
     void descend(const TreeView<Float> &tree, const Receiver<Float> &at,
                  Descent &s) const {
         WideNodeView<Float> node(tree, s.place.node, true);
-        ChildVisibility<Float> visibility = tree.child_visibility(at, s.place.node);
-        ChildWeights<Float> weights       = child_weights(
-            tree, at, node.clusters, tree.visibility ? &visibility : nullptr);
-        Float x                   = s.x * weights.total();
-        ChildChoice<Float> choice = choose_child(weights, node.child, x);
-        Float scale               = s.place.width / weights.total();
+        auto visibility             = tree.child_visibility(at, s.place.node);
+        ChildWeights<Float> weights = child_weights(tree, at, node.clusters, visibility);
+        Float x                     = s.x * weights.total();
+        ChildChoice<Float> choice   = choose_child(weights, node.child, x);
+        Float scale                 = s.place.width / weights.total();
         Place child{ choice.child, dr::fmadd(choice.begin, scale, s.place.begin),
                      choice.weight * scale, s.place.visibility };
-        if (tree.visibility)
-            child.visibility = visibility.factor(choice.slot, s.place.visibility);
+        if (visibility)
+            child.visibility = visibility->factor(choice.slot, s.place.visibility);
 
         // Remember this node if it holds a point beyond the child (the root needs no place)
         Mask push =
@@ -358,7 +357,7 @@ private:
                 clusters.axis[i].entry(slot) = unpack_axis<Float>(axis, i);
         }
         clusters.flux /= clusters.flux.entry(0) + clusters.flux.entry(1);
-        ChildWeights<Float> weights = child_weights(tree, at, clusters);
+        ChildWeights<Float> weights = child_weights(tree, at, clusters, {});
         return weights.weight.entry(0) / weights.total();
     }
 };

@@ -81,8 +81,7 @@ protected:
             return render();
         typename Learning::Block current(*m_learning, block_id, block_size);
         // By number, the blocks of later passes would have the seeds of other renderings
-        if (current.pass > 0)
-            seed = mitsuba::sample_tea_32(seed, UInt32(current.pass)).first;
+        seed     = pass_seed(seed, current.pass);
         block_id = current.number;
         render();
     }
@@ -94,6 +93,11 @@ private:
         if (m_params.learn_visibility != LearnVisibility::No)
             lock.lock();
         return lock;
+    }
+
+    /// The first pass has the seed of the rendering
+    static UInt32 pass_seed(const UInt32 &seed, uint32_t pass) {
+        return pass ? mitsuba::sample_tea_32(seed, UInt32(pass)).first : seed;
     }
 
     /// Gradients are computed from one recording, without passes
@@ -258,8 +262,7 @@ private:
                 break;
             m_learning->start_pass(pass);
             sampler->set_samples_per_wavefront(samples);
-            sampler->seed(pass ? mitsuba::sample_tea_32(seed, UInt32(pass)).first : seed,
-                          dr::prod(size) * samples);
+            sampler->seed(pass_seed(seed, pass), dr::prod(size) * samples);
             if (pass > 0)
                 sampler->advance();
             // One for each pass: sums do not depend on which thread got which part

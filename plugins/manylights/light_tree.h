@@ -14,6 +14,7 @@
 #include "tree_builder.h"
 #include "visibility.h"
 #include <drjit/dynamic.h>
+#include <optional>
 
 namespace manylights {
 
@@ -58,10 +59,11 @@ template <typename Float> struct TreeView {
     }
 
     /// What has been learnt of a wide node, if anything is learnt at all
-    ChildVisibility<Float> child_visibility(const Receiver &at,
-                                            const UInt32 &node) const {
-        return visibility ? visibility->children(at.cell, node)
-                          : ChildVisibility<Float>{ UInt32(0) };
+    std::optional<ChildVisibility<Float>> child_visibility(const Receiver &at,
+                                                           const UInt32 &node) const {
+        if (!visibility)
+            return {};
+        return visibility->children(at.cell, node);
     }
 
     Row<Float> row(const UInt32 &light, const Mask &active = true) const {
@@ -129,9 +131,10 @@ template <typename Float> struct ChildWeights {
  * an empty slot.
  */
 template <typename Float>
-ChildWeights<Float> child_weights(const TreeView<Float> &tree, const Receiver<Float> &at,
-                                  const Clusters<Float> &clusters,
-                                  const ChildVisibility<Float> *visibility = nullptr) {
+ChildWeights<Float>
+child_weights(const TreeView<Float> &tree, const Receiver<Float> &at,
+              const Clusters<Float> &clusters,
+              const std::optional<ChildVisibility<Float>> &visibility) {
     Four<Float> h = cluster_importance(at, clusters, tree.directions);
     Float sum     = (h.entry(0) + h.entry(1)) + (h.entry(2) + h.entry(3));
     /* On top of a light h overflows, very far away it vanishes: then the flux alone decides.
@@ -203,10 +206,9 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
         [&](State &s) {
             UInt32 index = s.link >> 2u, slot = s.link & 3u;
             WideNodeView<Float> node(tree, index, true);
-            ChildVisibility<Float> visibility = tree.child_visibility(at, index);
-            auto weights = child_weights(tree, at, node.clusters,
-                                         tree.visibility ? &visibility : nullptr);
-            Float w      = weights.weight.entry(0);
+            auto weights =
+                child_weights(tree, at, node.clusters, tree.child_visibility(at, index));
+            Float w = weights.weight.entry(0);
             for (uint32_t i = 1; i < 4; ++i)
                 w = dr::select(slot == i, weights.weight.entry(i), w);
             s.probability *= w / weights.total();

@@ -91,10 +91,6 @@ public:
         }
     }
 
-    static constexpr size_t bytes_per_record() {
-        return (1 + kCounts) * sizeof(uint32_t);
-    }
-
     /// The cell of a receiver, with borders that two random numbers move, so that they cannot
     /// be seen in the noise
     UInt32 cell(const Receiver<Float> &at, const UInt32 &random0,
