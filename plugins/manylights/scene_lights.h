@@ -211,13 +211,15 @@ public:
         m_tree.visibility = m_visibility.get();
     }
 
-    /// Use what was learnt so far, if it is worth it, and learn on if so wanted
-    void learn(bool go_on) {
-        if (!m_tree.visibility)
-            return;
-        if (m_visibility->learn() < kLeastGain)
+    /// Use what was learnt so far, if it is worth it, and learn on if that is wanted and worth
+    /// it, too. Returns whether it does.
+    bool learn(bool go_on) {
+        float gain = m_visibility->learn();
+        if (gain < kLeastGain)
             m_tree.visibility = nullptr;
+        go_on = go_on && gain > kLargeGain;
         m_visibility->set_counting(go_on);
+        return go_on;
     }
 
     void stop_learning(bool keep) {

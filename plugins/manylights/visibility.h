@@ -51,6 +51,8 @@ struct CellSize {
  * up took 26 % of time for nothing, and 0 in an open field.
  */
 constexpr float kLeastGain = .02f;
+/// The gain above which it is worth to learn from one more pass
+constexpr float kLargeGain = .1f;
 
 /// What is known of a node's children
 template <typename Float> struct ChildVisibility {
