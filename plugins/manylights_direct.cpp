@@ -43,7 +43,7 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
    - |bool| or |string|
    - Learn while rendering which lights can be seen from where, and prefer those. :code:`keep`
      goes on with what was learnt in earlier renderings, until lights or shapes move or lights
-     are added. Method :code:`resampled_tree` only. (Default: no, i.e. |false|)
+     are added. Method :code:`resampled_tree` only. (Default: yes, i.e. |true|)
 
  * - method
    - |string|
@@ -110,22 +110,23 @@ all of them are kept. Environment maps, suns and directional lights always take 
 **It works well** wherever a few of many lights matter at each point, and the more so the more
 lights there are. **It works less well**
 
-- where most lights are hidden, unless :code:`learn_visibility` is set, see below;
+- where most lights are hidden and there is too little to learn from, see below;
 - on glossy surfaces that reflect few of many bright lights: raise :code:`splitting_rate` and
   :code:`reservoirs` together;
 - for very few lights, or lights of equal importance, where Mitsuba's :monosp:`direct` does
   the same with less arithmetic.
 
-**Learning visibility.** The image is rendered in passes. For each cell of space and each node
-of the tree, the shadow rays of the first passes are counted: those that were traced to lights
-below each of its children, and the share :math:`v` of them that arrived. Later passes weight
-:math:`h`, :math:`H` and :math:`g` by :math:`\max(\sqrt{v}, 0.1)`. All samples count in the image,
-which stays unbiased, and the same seed gives the same bits. The table takes at most 38 MB. Where
-the first pass shows that nothing can be gained, the others are rendered as usual. Nothing is
-learnt from a single sample per pixel, from an odd number of them in JIT variants, where all lights
-are considered anyway, and while differentiating; an integrator that is nested in others which
-only ask it for samples uses what it has kept, and learns nothing. What was kept is dropped with
-the integrator: load another one to start anew.
+**Learning visibility.** A sixteenth of the samples is rendered in a first pass. For each cell of
+space and each node of the tree its shadow rays are counted: those that were traced to lights
+below each of its children, and the share :math:`v` of them that arrived. Later samples weight
+:math:`h`, :math:`H` and :math:`g` by :math:`\max(\sqrt{v}, 0.1)`. If much is hidden, a second
+sixteenth is counted as well; if nothing is, the rest is rendered as usual. All samples count in
+the image, which stays unbiased, and the same seed gives the same bits. The table takes at most 38
+MB. Nothing is learnt from fewer than four samples per pixel, from images with fewer than
+:math:`2^{19}` samples in LLVM variants or :math:`2^{24}` in CUDA variants, where another pass costs
+more than it gains, where all lights are considered anyway, and while differentiating; an
+integrator that is nested in others which only ask it for samples uses what it has kept, and learns
+nothing. What was kept is dropped with the integrator: load another one to start anew.
 
 Emitters of all kinds are supported. Point and spot lights and area lights on meshes, spheres,
 disks and cylinders are evaluated without virtual function calls, so that kernels do not grow

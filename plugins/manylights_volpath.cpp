@@ -46,7 +46,7 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
    - |bool| or |string|
    - Learn while rendering which lights can be seen from where, and prefer those. :code:`keep`
      goes on with what was learnt in earlier renderings, until lights or shapes move or lights
-     are added. Method :code:`resampled_tree` only. (Default: no, i.e. |false|)
+     are added. Method :code:`resampled_tree` only. (Default: yes, i.e. |true|)
 
  * - method
    - |string|
@@ -117,7 +117,7 @@ densities: no weight exceeds the number of channels.
 - in heterogeneous media with lights inside: their single scattering is estimated at the
   distance of a random flight, and has fireflies around point lights;
 - in dense media, where lights are chosen as if the medium reached as far as the light;
-- where most lights are hidden, unless :code:`learn_visibility` is set, see
+- where most lights are hidden and there is too little to learn from, see
   :monosp:`manylights_direct`.
 
 .. note:: Gradients of BSDFs, media and emitters flow through :code:`mi.render` in the

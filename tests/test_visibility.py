@@ -211,13 +211,13 @@ def test_what_is_kept_is_dropped_when_something_moves(variant, change):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
-@pytest.mark.parametrize("spp", [1, 7, 37])
+@pytest.mark.parametrize("spp", [1, 3, 7, 37])
 def test_numbers_of_samples(variant, spp):
     """One sample, or a number that is hard to divide, is rendered as well."""
     scene = mi.load_dict(hidden_points())
     image = render(scene, integrator(), spp=spp)
     assert np.isfinite(image).all()
-    if spp == 1:
+    if spp < 4:
         assert np.array_equal(image, render(scene, integrator(learn_visibility=False), spp=spp))
 
 
@@ -274,4 +274,4 @@ def test_bad_values_are_named(llvm, kind):
 def test_described(llvm):
     """`to_string` tells the value."""
     assert "learn_visibility = keep" in str(integrator(learn_visibility="keep"))
-    assert "learn_visibility = false" in str(mi.load_dict({"type": "manylights_direct"}))
+    assert "learn_visibility = true" in str(mi.load_dict({"type": "manylights_direct"}))

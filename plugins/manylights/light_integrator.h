@@ -141,7 +141,7 @@ private:
             spp          = sampler->sample_count();
             double total = (double) dr::prod(m_size) * spp;
             m_training   = training_samples(spp);
-            if (spp < 2 || total < kLeastTotal || total > kMostTotal)
+            if (spp < kLeastSamples || total < kLeastTotal || total > kMostTotal)
                 return;
             lights.start_learning(scene, cell_size(scene, sensor), total, keeps());
             m_passes                      = spp / m_training;
@@ -190,6 +190,8 @@ private:
 
     private:
         static constexpr uint32_t kTraining = 2, kOnePass = (uint32_t) -1; // Mitsuba's default
+        /// Of three, the first would be a large part, and it is the slowest
+        static constexpr uint32_t kLeastSamples = 4;
         /// A wavefront holds no more samples, and Mitsuba itself splits more
         static constexpr double kMostTotal = dr::is_jit_v<Float> ? 0x1p32 : dr::Infinity<double>;
         /// With fewer samples, recording one more pass takes longer than it may gain

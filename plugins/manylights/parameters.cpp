@@ -71,7 +71,7 @@ LearnVisibility read_learning(const Properties &props, Method method) {
             refuse(props, name, "\"" + text + "\"", "a boolean or \"keep\"");
         return LearnVisibility::Keep;
     }
-    return props.get<bool>(name, false) ? LearnVisibility::Yes : LearnVisibility::No;
+    return props.get<bool>(name, true) ? LearnVisibility::Yes : LearnVisibility::No;
 }
 
 /// Parameters that would have no effect are mistakes

@@ -29,7 +29,7 @@ struct SamplingParameters {
     float deeper_candidates = 1.f, deeper_rays = 1.f;
     /// Are the candidates and the visited nodes counted, in film channels?
     bool counts                      = false;
-    LearnVisibility learn_visibility = LearnVisibility::No;
+    LearnVisibility learn_visibility = LearnVisibility::Yes;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {

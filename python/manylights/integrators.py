@@ -23,7 +23,7 @@ SAMPLING_PARAMETERS = {
     "shadow_rays": "integer from 1 to the number of reservoirs, default 4",
     "method": "resampled_tree, talk, adaptive_splitting, tree, exhaustive, default resampled_tree",
     "split_function": "near or far, default near, for method=talk only",
-    "learn_visibility": "true, false or keep, default false, for method=resampled_tree only",
+    "learn_visibility": "true, false or keep, default true, for method=resampled_tree only",
     "counts": "true or false, default false, adds channels candidates and node_visits",
 }
 
