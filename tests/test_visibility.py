@@ -188,6 +188,64 @@ def test_what_is_kept_is_used(variant):
     assert test.pvalue < SIGNIFICANCE
 
 
+def floor_under_slats():
+    """A floor seen from above, under wide slats with lights above them, 8 m wide."""
+    rng = np.random.default_rng(1)
+    transform = mi.ScalarTransform4f
+    places = rng.uniform([-4.0, -4.0, 1.2], [4.0, 4.0, 1.8], (1000, 3))
+    values = 10.0 ** rng.uniform(-1.0, 1.0, 1000)
+    scene = manylights.scenes.cut_boundary(1, width=512, height=64, spp=16)
+    for index, (place, value) in enumerate(zip(places, values)):
+        intensity = {"type": "rgb", "value": float(value)}
+        scene[f"light_{index}"] = {"type": "point", "position": list(place), "intensity": intensity}
+    for index in range(11):
+        wide = transform().translate([0.97 * index - 4.72, 0.0, 0.9]).scale([0.32, 10.0, 1.0])
+        scene[f"slat_{index}"] = {"type": "rectangle", "to_world": wide}
+    above = transform().look_at([0.0, 0.0, 0.4], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    scene["sensor"]["to_world"] = above.scale([4.0, 4.0, 1.0])
+    return scene
+
+
+def steps(noise, shift):
+    """Steps of the logarithm of the noise where columns cross borders of cells, plus `shift` cells.
+
+    Takes rows in groups of eight. Cells have a side of .3 times the distance from the camera,
+    rounded to a power of two (`visibility.h`).
+    """
+    noise = np.log(noise.reshape(8, 8, -1).mean(axis=1))
+    width = noise.shape[1]
+    columns = np.arange(4, width - 4)
+    x = 8.0 * columns / width - 4.0
+    border = (x / cell_sides(x) - shift) % 1.0 == 0.0
+    return np.concatenate(
+        [
+            noise[:, i : i + 2].mean(axis=1) - noise[:, i - 2 : i].mean(axis=1)
+            for i in columns[border]
+        ]
+    )
+
+
+def cell_sides(x):
+    """Side of the cells below `floor_under_slats`'s camera, which is .4 m above x = 0."""
+    return 2.0 ** np.floor(np.log2(0.3 * np.hypot(0.4, x)))
+
+
+def border_pvalue(noise):
+    """Are the steps at borders of cells larger than in their middle?"""
+    at, between = np.abs(steps(noise, 0.0)), np.abs(steps(noise, 0.5))
+    return stats.mannwhitneyu(at, between, alternative="greater").pvalue
+
+
+def test_no_borders_of_cells_in_the_noise(llvm):
+    """Nothing changes there at once; 15 % more noise in every other cell would be found."""
+    scene = mi.load_dict(floor_under_slats())
+    noise = images(scene, integrator(), range(16))[..., 1].var(axis=0, ddof=1)
+    assert border_pvalue(noise) > SIGNIFICANCE
+    x = 8.0 * (np.arange(noise.shape[1]) + 0.5) / noise.shape[1] - 4.0
+    odd = np.floor(x / cell_sides(x)) % 2.0
+    assert border_pvalue(noise * (1.0 + 0.15 * odd) ** 2) < SIGNIFICANCE
+
+
 CHANGES = {
     "a wall": ("wall.vertex_positions", lambda x: x + 0.25, True),
     "a light": ("light_0.position", lambda x: x + 0.25, True),

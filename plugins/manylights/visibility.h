@@ -39,6 +39,13 @@ constexpr float kCellGrowth = .3f;
 /// Limits of the side, in parts of the scene's diagonal
 constexpr float kLeastCell = 1e-4f, kLargestCell = .125f;
 
+/**
+ * Receivers are moved by up to half a cell before they are looked up. With 0, 1/4, 1/2 and a
+ * whole one, that house had relative variances of .188, .196, .202, .217 and (10,000 lights)
+ * .464, .532, .538, .564; but with 1/4 and less the noise changes visibly at borders.
+ */
+constexpr float kJitter = .5f;
+
 /// What the size of cells depends on: the camera's position and the scene's diagonal
 struct CellSize {
     float camera[3], scene;
@@ -109,7 +116,7 @@ public:
         UInt32 shift[3] = { a & 0xffffu, a >> 16u, b & 0xffffu };
         UInt32 hash     = level;
         for (size_t i = 0; i < 3; ++i) {
-            Float x = dr::fmadd(p.entry(i), scale, Float(shift[i]) * 0x1p-16f);
+            Float x = dr::fmadd(p.entry(i), scale, Float(shift[i]) * kJitter * 0x1p-16f);
             hash    = mix(hash ^ UInt32(dr::floor2int<Int32>(x)));
         }
         return mix(hash ^ face(at));
