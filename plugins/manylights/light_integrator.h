@@ -84,6 +84,7 @@ protected:
         seed     = pass_seed(seed, current.pass);
         block_id = current.number;
         render();
+        current.put(block);
     }
 
 private:
@@ -127,8 +128,8 @@ private:
     public:
         Learning(LightIntegrator &integrator, const Scene *scene, Sensor *sensor,
                  uint32_t spp, Lights &lights)
-            : m_integrator(integrator), m_lights(lights),
-              m_size(film_size(sensor->film())) {
+            : m_integrator(integrator), m_lights(lights), m_film(sensor->film()),
+              m_size(film_size(m_film)) {
             const SamplingParameters &params = integrator.m_params;
             if (params.learn_visibility == LearnVisibility::No || integrator.m_learning ||
                 integrator.m_differentiating ||
@@ -181,6 +182,12 @@ private:
                 if (pass == l.m_started)
                     l.start_pass(pass, l.m_training);
             }
+            /// Mitsuba would put it into the film after the next pass may have begun: sums
+            /// would depend on which is first. All that is left to it is zeros.
+            void put(ImageBlock *block) {
+                learning.m_film->put_block(block);
+                block->clear();
+            }
             ~Block() {
                 std::lock_guard<std::mutex> lock(learning.m_mutex);
                 ++learning.m_blocks_done;
@@ -225,6 +232,7 @@ private:
 
         LightIntegrator &m_integrator;
         Lights &m_lights;
+        Film *m_film;
         mitsuba::Vector<uint32_t, 2> m_size;
         /// Samples per pixel of a training pass, and how many of its size there are
         uint32_t m_training, m_passes;
