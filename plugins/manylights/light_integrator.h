@@ -38,7 +38,7 @@ public:
         Learning learning(*this, scene, sensor, spp, guard.lights());
         if constexpr (dr::is_jit_v<Float>)
             if (m_learning == &learning)
-                return render_passes(scene, sensor, seed, develop);
+                return render_passes(scene, sensor, seed, develop, evaluate);
         return Base::render(scene, sensor, seed, spp, develop, evaluate);
     }
 
@@ -243,7 +243,8 @@ private:
     };
 
     /// JIT variants: Mitsuba's passes are all of one size, those of \ref Learning are not
-    TensorXf render_passes(Scene *scene, Sensor *sensor, UInt32 seed, bool develop) {
+    TensorXf render_passes(Scene *scene, Sensor *sensor, UInt32 seed, bool develop,
+                           bool evaluate) {
         m_stop = false;
         m_render_timer.reset();
         Film *film    = sensor->film();
@@ -266,6 +267,8 @@ private:
         } else {
             film->schedule_storage();
         }
+        if (!evaluate)
+            return result;
         dr::eval();
         dr::sync_thread();
         if (!m_stop)
@@ -315,7 +318,7 @@ private:
         sampler->set_samples_per_wavefront(lanes.samples);
         sampler->seed(seed, lanes.size(dr::prod(size)));
         // Those before have been rendered: skipped if the wavefront lacks them, else masked
-        for (; stratified && lanes.samples < spp && first > 0; first -= samples)
+        for (uint32_t i = 0; stratified && lanes.samples < spp && i < first; i += samples)
             sampler->advance();
 
         // Passes differ in these numbers: opaque, so that they have one kernel
@@ -325,14 +328,15 @@ private:
         UInt32 pixel    = dr::fmadd(block, dr::opaque<UInt32>(lanes.pixels), local);
         Mask active     = local < dr::opaque<UInt32>(lanes.pixels) &&
                       pixel < dr::prod(size) &&
-                      j >= dr::opaque<UInt32>(stratified ? first : 0);
+                      j >= dr::opaque<UInt32>(lanes.samples > samples ? first : 0);
 
         // One for each pass: sums do not depend on which thread got which part
         mitsuba::ref<ImageBlock> image = film->create_block();
         image->set_offset(film->crop_offset());
         render_sample(scene, sensor, sampler, image, aovs, position(film, size, pixel),
                       dr::rsqrt((ScalarFloat) spp), active);
-        dr::eval(image->tensor());
+        if (first + samples < spp) // the last pass waits as any other rendering does
+            dr::eval(image->tensor());
         film->put_block(image);
         sampler->set_sample_count(spp);
         sampler->set_samples_per_wavefront(spp);
