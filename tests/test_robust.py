@@ -79,6 +79,9 @@ try:
     dr.sync_thread()
 except KeyboardInterrupt:
     sys.exit(3)
+except RuntimeError as error:
+    # What comes while mi.render itself works, drjit.custom() wraps
+    sys.exit(3 if isinstance(error.__cause__, KeyboardInterrupt) else 1)
 """
 
 
