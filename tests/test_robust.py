@@ -81,7 +81,9 @@ except KeyboardInterrupt:
     sys.exit(3)
 except RuntimeError as error:
     # What comes while mi.render itself works, drjit.custom() wraps
-    sys.exit(3 if isinstance(error.__cause__, KeyboardInterrupt) else 1)
+    if not isinstance(error.__cause__, KeyboardInterrupt):
+        raise
+    sys.exit(3)
 """
 
 

@@ -22,6 +22,9 @@ SWEEPS = (
     *(f"talk:splitting_rate={value}:split_function=far" for value in SPLITTING_RATES),
 )
 
+#: What is lost where lights are hidden and nobody learns that.
+NOT_LEARNT = ("resampled_tree:learn_visibility=false",)
+
 
 def standard() -> list[Job]:
     """Return the scenes of ``--standard``.
@@ -33,14 +36,17 @@ def standard() -> list[Job]:
     path, fog = "integrator=path,max_depth=6", "max_depth=4"
     return [
         *(_city(lights) for lights in (10, 100)),
-        _city(1_000, SWEEPS),
+        _city(1_000, (*SWEEPS, *NOT_LEARNT)),
         *(_city(lights) for lights in (10_000, 100_000, 1_000_000)),
         _job("city_points_1k", "City, 1,000 points", "city:1000,kind=points", SWEEPS),
-        _job("rooms_1k", "Rooms, paths of 5 bounces", f"rooms:1000,{path}"),
-        _job("fog_open_1k", "Field in fog, 3 bounces", f"fog_open:1000,{fog}"),
+        _job("rooms_1k", "Rooms, paths of 5 bounces", f"rooms:1000,{path}", NOT_LEARNT),
+        _job("house_1k", "House with doors, 1,000 bulbs", "house:1000", NOT_LEARNT, "house"),
+        _job("house_10k", "House with doors, 10,000 bulbs", "house:10000", NOT_LEARNT, "house"),
+        _job("fog_rooms_1k", "Rooms in fog, 3 bounces", f"fog_rooms:1000,{fog}", NOT_LEARNT),
+        _job("fog_open_1k", "Field in fog, 3 bounces", f"fog_open:1000,{fog}", NOT_LEARNT),
         _job("glossy_1k", "Rough metal, 1,000 lamps", "glossy:1000", family="glossy"),
         _job("glossy_10k", "Rough metal, 10,000 lamps", "glossy:10000", family="glossy"),
-        _job("behind_wall", "Bright lights behind a wall", "behind_wall:1000"),
+        _job("behind_wall", "Bright lights behind a wall", "behind_wall:1000", NOT_LEARNT),
         _job("bright_far", "One bright light far away", "bright_far:1000"),
         _job("one_light", "A single point light", "open_plane:1"),
         _job("one_light_path", "A single point light, paths", f"open_plane:1,{path}"),
