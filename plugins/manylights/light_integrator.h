@@ -199,8 +199,8 @@ private:
         static constexpr uint32_t kTraining = 2, kOnePass = (uint32_t) -1; // Mitsuba's default
         /// Of three, the first would be a large part, and it is the slowest
         static constexpr uint32_t kLeastSamples = 4;
-        /// A wavefront holds no more samples, and Mitsuba itself splits more
-        static constexpr double kMostTotal = dr::is_jit_v<Float> ? 0x1p32 : dr::Infinity<double>;
+        /// A wavefront has less than 2^32 lanes, and some may be left over
+        static constexpr double kMostTotal = dr::is_jit_v<Float> ? 0x1p31 : dr::Infinity<double>;
         /// With fewer samples, recording one more pass takes longer than it may gain
         static constexpr double kLeastTotal =
             dr::is_cuda_v<Float> ? 0x1p24 : (dr::is_llvm_v<Float> ? 0x1p19 : 0);
@@ -289,19 +289,20 @@ private:
     };
 
     /**
-     * Of the independent sampler, any number of samples. No pixel is split between two threads
-     * or warps that are not full, whose sums would depend on which of them came first. Of
-     * stratified samplers, a number that divides the whole, or else all samples.
+     * Of the independent sampler, any number of samples. No pixel is split between threads, or
+     * warps that are not full, whose sums would depend on which of them came first, unless more
+     * than an eighth of the lanes would be left over. Of stratified samplers, a number that
+     * divides the whole, or else all samples.
      */
     static Wavefront wavefront(bool stratified, uint32_t first, uint32_t samples,
                                uint32_t spp) {
-        if (stratified) {
-            uint32_t lanes = first % samples || spp % samples ? spp : samples;
-            return { lanes, 1, lanes };
-        }
         uint32_t block = dr::is_cuda_v<Float> ? 32 : jit_llvm_block_size();
         block          = std::max(block, mitsuba::math::round_to_power_of_two(samples));
-        return { block, block / samples, samples };
+        if (!stratified && block % samples <= block / 8)
+            return { block, block / samples, samples };
+        bool divides   = first % samples == 0 && spp % samples == 0;
+        uint32_t lanes = stratified && !divides ? spp : samples;
+        return { lanes, 1, lanes };
     }
 
     /// Render some of each pixel's samples, from number `first` on
