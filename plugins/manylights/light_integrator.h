@@ -196,11 +196,13 @@ private:
         };
 
     private:
-        static constexpr uint32_t kTraining = 2, kOnePass = (uint32_t) -1; // Mitsuba's default
+        static constexpr uint32_t kTraining = 2,
+                                  kOnePass  = (uint32_t) -1; // Mitsuba's default
         /// Of three, the first would be a large part, and it is the slowest
         static constexpr uint32_t kLeastSamples = 4;
         /// A wavefront has less than 2^32 lanes, and some may be left over
-        static constexpr double kMostTotal = dr::is_jit_v<Float> ? 0x1p31 : dr::Infinity<double>;
+        static constexpr double kMostTotal =
+            dr::is_jit_v<Float> ? 0x1p31 : dr::Infinity<double>;
         /// With fewer samples, recording one more pass takes longer than it may gain
         static constexpr double kLeastTotal =
             dr::is_cuda_v<Float> ? 0x1p24 : (dr::is_llvm_v<Float> ? 0x1p19 : 0);
@@ -247,9 +249,9 @@ private:
                            bool evaluate) {
         m_stop = false;
         m_render_timer.reset();
-        Film *film    = sensor->film();
-        auto size     = film_size(film);
-        uint32_t spp  = sensor->sampler()->sample_count();
+        Film *film   = sensor->film();
+        auto size    = film_size(film);
+        uint32_t spp = sensor->sampler()->sample_count();
         Log(mitsuba::Info, "Starting render job (%ux%u, %u samples, learning visibility)",
             size.x(), size.y(), spp);
 
@@ -328,8 +330,8 @@ private:
         auto [local, j] = divide(i, lanes.samples);
         UInt32 pixel    = dr::fmadd(block, dr::opaque<UInt32>(lanes.pixels), local);
         Mask active     = local < dr::opaque<UInt32>(lanes.pixels) &&
-                      pixel < dr::prod(size) &&
-                      j >= dr::opaque<UInt32>(lanes.samples > samples ? first : 0);
+                          pixel < dr::prod(size) &&
+                          j >= dr::opaque<UInt32>(lanes.samples > samples ? first : 0);
 
         // One for each pass: sums do not depend on which thread got which part
         mitsuba::ref<ImageBlock> image = film->create_block();
