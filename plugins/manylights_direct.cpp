@@ -64,8 +64,10 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
  * - counts
    - |bool|
    - Adds the film channels :code:`candidates` and :code:`node_visits`: how many lights were
-     considered, and how many nodes of the tree visited, on average per camera ray.
-     (Default: no, i.e. |false|)
+     considered, and how many nodes of the tree visited, on average per camera ray. Method
+     :code:`resampled_tree` adds :code:`expected`: the luminance of the candidates' light that
+     should arrive by what is known of their visibility, all of it where nothing is known, 0
+     where shadow rays are traced to all lights. (Default: no, i.e. |false|)
 
  * - lights, lights_in_tree, nodes, depth
    - |int|
@@ -194,7 +196,7 @@ public:
         Mask valid_ray = active;
         manylights::Counts<Float> counts;
         if (m_params.counts)
-            counts.write(aovs);
+            counts.write(aovs, m_params);
         if (dr::none_or<false>(active))
             return { result, valid_ray };
 
@@ -208,7 +210,7 @@ public:
         if (dr::any_or<true>(smooth))
             result += direct.sample_lights(vertex, counts, smooth);
         if (m_params.counts)
-            counts.write(aovs);
+            counts.write(aovs, m_params);
         if (direct.needs_bsdf_samples())
             result += direct.sample_bsdf(vertex, sampler, active);
         return { result, valid_ray };

@@ -61,7 +61,8 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
  * - counts
    - |bool|
    - Adds the film channels :code:`candidates` and :code:`node_visits`: how many lights were
-     considered, and how many nodes of the tree visited, on average per path.
+     considered, and how many nodes of the tree visited, on average per path, and
+     :code:`expected` as :monosp:`manylights_direct`, summed over the vertices.
      (Default: no, i.e. |false|)
 
  * - lights, lights_in_tree, nodes, depth
@@ -166,7 +167,7 @@ public:
         auto result = manylights::call_flat<Float>(
             [&] { return tracer.trace(sampler, Ray3f(ray), medium, counts, active); });
         if (m_params.counts)
-            counts.write(aovs);
+            counts.write(aovs, m_params);
         return result;
     }
 

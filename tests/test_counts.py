@@ -1,4 +1,4 @@
-"""The film channels `candidates` and `node_visits`, which the parameter `counts` adds."""
+"""The film channels that the parameter `counts` adds."""
 
 import mitsuba as mi
 import numpy as np
@@ -31,9 +31,9 @@ def counts_of(plugin, **parameters):
 @both_variants
 @both_plugins
 def test_colours_stay_the_same(variant, plugin):
-    """Two channels follow the colours, which change by rounding only (a kernel of its own)."""
+    """Three channels follow the colours, which change by rounding only (a kernel of its own)."""
     plain, counted = render(plugin), render(plugin, counts=True)
-    assert plain.shape[2] == 3 and counted.shape[2] == 5
+    assert plain.shape[2] == 3 and counted.shape[2] == 6
     np.testing.assert_allclose(counted[..., :3], plain, rtol=1e-5, atol=1e-7)
     assert np.isfinite(counted).all()
 
@@ -76,9 +76,14 @@ def test_paths_add_up_their_vertices(variant):
 def test_names_of_the_channels(variant):
     """They are names of film channels, also behind those of `aov`."""
     ours = {"type": "manylights_direct", "counts": True}
-    assert channels(ours) == ["R", "G", "B", "candidates", "node_visits"]
+    assert channels(ours) == ["R", "G", "B", "candidates", "node_visits", "expected"]
+    talk = {**ours, "method": "talk"}
+    assert channels(talk) == ["R", "G", "B", "candidates", "node_visits"]
     nested = channels({"type": "aov", "aovs": "depth:depth", "image": ours})
-    assert nested[-3:] == ["image.candidates", "image.node_visits", "depth.T"]
+    assert nested[-4:] == [
+        *("image.candidates", "image.node_visits", "image.expected"),
+        "depth.T",
+    ]
     assert not mi.load_dict({"type": "manylights_direct"}).aov_names()
 
 

@@ -246,6 +246,26 @@ def test_no_borders_of_cells_in_the_noise(llvm):
     assert border_pvalue(noise * (1.0 + 0.15 * odd) ** 2) < SIGNIFICANCE
 
 
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("rate", [1, 4])  # few candidates are all kept, many are resampled
+def test_what_is_expected(variant, rate):
+    """What should arrive by what was learnt looks like what arrives, and unlike all the light."""
+    scene = mi.load_dict(hidden_points())
+
+    def channels(learn):
+        method = integrator(learn_visibility=learn, splitting_rate=rate, counts=True)
+        render(scene, method)
+        image = render(scene, method, seed=1, spp=64)
+        lit = image[..., :3].mean(axis=-1), image[..., 5]
+        return [x.reshape(x.shape[0] // 8, 8, -1, 8).mean(axis=(1, 3)).ravel() for x in lit]
+
+    arrived, expected = channels("keep")
+    _, unshadowed = channels(False)
+    near = np.abs(expected - arrived).sum()
+    assert near < 0.5 * np.abs(unshadowed - arrived).sum()
+    assert np.corrcoef(expected, arrived)[0, 1] > np.corrcoef(unshadowed, arrived)[0, 1]
+
+
 CHANGES = {
     "a wall": ("wall.vertex_positions", lambda x: x + 0.25, True),
     "a light": ("light_0.position", lambda x: x + 0.25, True),

@@ -233,7 +233,7 @@ private:
                        ? keep_candidates(vertex, cursor, u, counts, active)
                        : keep_resampled(vertex,
                                         resample(vertex.at, cursor, u, counts, active),
-                                        active);
+                                        counts, active);
         };
         if (m_all)
             return keep(AllLights<FloatD>(dr::opaque<UInt32D>(light_count())));
@@ -261,9 +261,11 @@ private:
             Kept kept;
             Rng rng;
             UInt32D slot;
-            DRJIT_STRUCT(State, cursor, kept, rng, slot)
+            FloatD expected;
+            DRJIT_STRUCT(State, cursor, kept, rng, slot, expected)
             State(const Cursor &cursor, Kept &&kept, Rng &&rng)
-                : cursor(cursor), kept(std::move(kept)), rng(std::move(rng)), slot(0) {}
+                : cursor(cursor), kept(std::move(kept)), rng(std::move(rng)), slot(0),
+                  expected(0.f) {}
         };
         State state(cursor, Kept(m_slots, m_items), make_rng(u));
         MaskD on = plain(active);
@@ -282,13 +284,23 @@ private:
                     FloatD g =
                         light_target(vertex, candidate.light, p, s.slot, active && valid);
                     g *= candidate.visibility;
+                    if (m_params.counts)
+                        s.expected +=
+                            expected_light(weight * g, candidate.visibility, valid);
                     write_slot<FloatD>(kept.target, s.slot, weight * g, m_items, valid);
                 }
                 s.slot += dr::select(valid, UInt32D(1), UInt32D(0));
             },
             "Direct light: candidates");
         counts.add(state.slot, state.cursor.visits, active);
+        counts.expected += state.expected;
         return std::move(state.kept);
+    }
+
+    /// For film channels: the light of a weighted target F f that should arrive, F f^2 = F v
+    static FloatD expected_light(const FloatD &target, const FloatD &visibility,
+                                 const MaskD &active) {
+        return dr::select(active, target * visibility, 0.f);
     }
 
     /// Stage 2: deal the candidates to m reservoirs
@@ -326,11 +338,12 @@ private:
 
     /// C = W / H, and the targets
     Kept keep_resampled(const Vertex &vertex, const Reservoirs<FloatD> &reservoirs,
-                        Mask active) const {
+                        Counts<Float> &counts, Mask active) const {
         struct State {
             UInt32D slot;
             Slots<FloatD> target;
-            DRJIT_STRUCT(State, slot, target)
+            FloatD expected;
+            DRJIT_STRUCT(State, slot, target, expected)
         };
         Kept kept(m_slots, m_items);
         kept.light       = reservoirs.light;
@@ -340,7 +353,7 @@ private:
         if (!m_choose)
             return kept;
 
-        State state{ UInt32D(0), kept.target };
+        State state{ UInt32D(0), kept.target, FloatD(0.f) };
         MaskD on = plain(active);
         loop(
             state, [&](const State &s) { return on && s.slot < m_slots; },
@@ -350,12 +363,18 @@ private:
                     light_target(vertex, read_slot<UInt32D>(kept.light, s.slot, m_slots),
                                  read_slot<FloatD>(kept.probability, s.slot, m_slots),
                                  s.slot, active && weight > 0.f);
-                target *= read_slot<FloatD>(reservoirs.visibility, s.slot, m_slots);
+                FloatD visibility =
+                    read_slot<FloatD>(reservoirs.visibility, s.slot, m_slots);
+                target *= visibility;
+                if (m_params.counts)
+                    s.expected +=
+                        expected_light(weight * target, visibility, weight > 0.f);
                 write_slot<FloatD>(s.target, s.slot, weight * target, m_items, true);
                 s.slot += 1u;
             },
             "Direct light: targets");
         kept.target = state.target;
+        counts.expected += state.expected;
         return kept;
     }
 

@@ -135,6 +135,8 @@ SamplingParameters read_path_parameters(const Properties &props) {
 std::vector<std::string> count_channels(const SamplingParameters &p) {
     if (!p.counts)
         return {};
+    if (p.method == Method::ResampledTree)
+        return { "candidates", "node_visits", "expected" };
     return { "candidates", "node_visits" };
 }
 

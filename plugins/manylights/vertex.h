@@ -6,6 +6,7 @@
  */
 
 #include "media.h"
+#include "parameters.h"
 #include "segment.h"
 
 namespace manylights {
@@ -28,8 +29,8 @@ template <typename Float> struct Effort {
 /// What light sampling did, for those who ask: where nobody does, it drops out of kernels
 template <typename Float> struct Counts {
     using FloatD      = dr::detached_t<Float>;
-    FloatD candidates = FloatD(0.f), node_visits = FloatD(0.f);
-    DRJIT_STRUCT(Counts, candidates, node_visits)
+    FloatD candidates = FloatD(0.f), node_visits = FloatD(0.f), expected = FloatD(0.f);
+    DRJIT_STRUCT(Counts, candidates, node_visits, expected)
 
     template <typename UInt32>
     void add(const UInt32 &found, const UInt32 &visits, const dr::mask_t<Float> &active) {
@@ -37,10 +38,12 @@ template <typename Float> struct Counts {
         candidates += dr::select(on, FloatD(found), 0.f);
         node_visits += dr::select(on, FloatD(visits), 0.f);
     }
-    /// Film channels
-    void write(Float *aovs) const {
+    /// Film channels, see \ref count_channels
+    void write(Float *aovs, const SamplingParameters &params) const {
         aovs[0] = Float(candidates);
         aovs[1] = Float(node_visits);
+        if (params.method == Method::ResampledTree)
+            aovs[2] = Float(expected);
     }
 };
 

@@ -24,7 +24,7 @@ SAMPLING_PARAMETERS = {
     "method": "resampled_tree, talk, adaptive_splitting, tree, exhaustive, default resampled_tree",
     "split_function": "near or far, default near, for method=talk only",
     "learn_visibility": "true, false or keep, default true, for method=resampled_tree only",
-    "counts": "true or false, default false, adds channels candidates and node_visits",
+    "counts": "true or false, default false, adds channels candidates, node_visits, expected",
 }
 
 #: What each plugin accepts, for error messages and help. The plugins themselves check the values.

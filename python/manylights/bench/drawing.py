@@ -52,10 +52,13 @@ def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
     return Drawing(image, seconds, cpu_seconds)
 
 
-def draw_channels(loaded: LoadedScene, integrator, spp: int, seed: int, count: int) -> np.ndarray:
-    """Render a scene and return the last ``count`` channels, those the integrator adds."""
+def draw_channels(
+    loaded: LoadedScene, integrator, spp: int, seed: int, names: list[str]
+) -> np.ndarray:
+    """Render a scene and return those channels that the integrator adds under these names."""
     pixels = np.array(integrator.render(loaded.scene, sensor=0, seed=seed, spp=spp))
-    return pixels[..., -count:]
+    added = integrator.aov_names()
+    return pixels[..., [added.index(name) - len(added) for name in names]]
 
 
 def _render(loaded: LoadedScene, integrator, spp: int, seed: int) -> np.ndarray:

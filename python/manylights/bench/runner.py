@@ -423,8 +423,9 @@ class SceneRun:
             return
         description = integrator_for(candidate.method, self.loaded.kind)
         counting = mi.load_dict({**description, "counts": True})
-        maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, 2)
-        self.found.write_image(self.entry["name"], name, maps, ["candidates", "node_visits"])
+        channels = ["candidates", "node_visits"]
+        maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, channels)
+        self.found.write_image(self.entry["name"], name, maps, channels)
 
 
 def _new_series(method: Method, loaded: LoadedScene) -> dict[str, Any]:
