@@ -122,7 +122,9 @@ private:
      * scalar ones in passes of the same size. Relative variance times time of a second
      * training pass and of none, in llvm_ad_rgb with 64 samples for each of 256x144 pixels: .91
      * and .98 in a house of 108 rooms with 10,000 and 1,000 lights, 1.04 to 1.12 where less is
-     * hidden. Passes that double and all learn took 1.1 to 1.2 times as long as two.
+     * hidden. More teach little: trained for 2, 4, 8 and all of 16 passes of the same size, that
+     * house with 1,000 lights had .194, .189, .187 and .187 of relative variance at 603, 628, 664
+     * and 742 ns a sample.
      */
     class Learning {
     public:
