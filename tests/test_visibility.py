@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests import light_scenes
 from tests import statistics_tools as tools
 from tests.path_references import quick_and_slow
 from tests.statistics_tools import SIGNIFICANCE
@@ -56,20 +57,8 @@ def hidden_lamps():
     corners = np.concatenate([front, back])[:, None] + np.array(
         [[0.0, 0.0, 0.0], [0.0, 0.7, 0.0], [0.7, 0.7, 0.0], [0.7, 0.0, 0.0]]
     )
-    lamps = mi.Mesh("lamps", 4 * len(corners), 2 * len(corners), props=lamp_properties())
-    params = mi.traverse(lamps)
-    first = 4 * np.arange(len(corners))[:, None]
-    params["vertex_positions"] = corners.ravel()
-    params["faces"] = (first + np.array([[0, 1, 2, 0, 2, 3]])).ravel()
-    params.update()
-    return {**scene, "lamps": lamps}
-
-
-def lamp_properties():
-    """The emission of all lamps."""
-    props = mi.Properties()
-    props["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": 2.0}})
-    return props
+    triangles = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+    return {**scene, "lamps": light_scenes.make_mesh(triangles, light_scenes.rgb([2.0, 2.0, 2.0]))}
 
 
 SCENES = {"points": hidden_points, "fog": lambda: hidden_points(fog=True), "lamps": hidden_lamps}
@@ -88,7 +77,7 @@ def render(scene, method, seed=0, spp=32):
 
 def images(scene, method, seeds=range(12)):
     """Images of several seeds."""
-    return np.stack([render(scene, method, seed) for seed in seeds])
+    return tools.render_seeds(scene, method, 32, seeds)
 
 
 #: What an integrator is compared with: every light at each point, or many without learning.
@@ -256,8 +245,8 @@ def test_what_is_expected(variant, rate):
         method = integrator(learn_visibility=learn, splitting_rate=rate, counts=True)
         render(scene, method)
         image = render(scene, method, seed=1, spp=64)
-        lit = image[..., :3].mean(axis=-1), image[..., 5]
-        return [x.reshape(x.shape[0] // 8, 8, -1, 8).mean(axis=(1, 3)).ravel() for x in lit]
+        tiles = tools.tile_means(image[np.newaxis], 8)
+        return tiles[..., :3].mean(axis=-1).ravel(), tiles[..., 5].ravel()
 
     arrived, expected = channels("keep")
     _, unshadowed = channels(False)

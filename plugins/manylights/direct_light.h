@@ -89,8 +89,7 @@ public:
                        m_lights.glossy() && !m_all,
                        Extent::Point,
                        active };
-        if (m_learns)
-            vertex.at.cell = cell(vertex);
+        find_cell(vertex);
         return vertex;
     }
 
@@ -101,8 +100,7 @@ public:
                            Mask active) const {
         Vertex vertex{ behind,        no_bsdf, &inside,         u,
                        effort(first), false,   Extent::Segment, active };
-        if (m_learns)
-            vertex.at.cell = cell(vertex);
+        find_cell(vertex);
         return vertex;
     }
 
@@ -383,12 +381,17 @@ private:
                  Point2fD(plain(u.point.x()), plain(u.point.y())) };
     }
 
+    /// All the bits of a vertex' numbers, in two
+    static std::pair<UInt32D, UInt32D> seed_bits(const LightSample<FloatD> &u) {
+        auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
+        return { bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
+                 bits(u.point.y()) + bits(u.selection) };
+    }
+
     /// Numbers that need no stratification, seeded with the bits of those that have it
     static Rng make_rng(const LightSample<FloatD> &u, uint64_t stream = 1) {
-        auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
-        auto [a, b] =
-            mitsuba::sample_tea_32(bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
-                                   bits(u.point.y()) + bits(u.selection));
+        auto bits     = seed_bits(u);
+        auto [a, b]   = mitsuba::sample_tea_32(bits.first, bits.second);
         using UInt64D = dr::uint64_array_t<UInt32D>;
         return Rng(1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(stream));
     }
@@ -536,12 +539,12 @@ private:
     }
 
     /// Where visibility is learnt and looked up, see \ref VisibilityTable::cell
-    UInt32D cell(const Vertex &vertex) const {
-        auto u    = plain_sample(vertex.u);
-        auto bits = [](const FloatD &x) { return dr::reinterpret_array<UInt32D>(x); };
-        return m_lights.tree().visibility->cell(
-            vertex.at, bits(u.point.x()) ^ (bits(u.tree) * 0x9e3779b9u),
-            bits(u.point.y()) + bits(u.selection));
+    void find_cell(Vertex &vertex) const {
+        if (!m_learns)
+            return;
+        auto bits = seed_bits(plain_sample(vertex.u));
+        vertex.at.cell =
+            m_lights.tree().visibility->cell(vertex.at, bits.first, bits.second);
     }
 
     Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,
