@@ -209,6 +209,9 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
     F4 t = dr::fmadd(wx, F4(at.n.x()), dr::fmadd(wy, F4(at.n.y()), wz * at.n.z()));
     t    = dr::select(at.transmits, dr::abs(t), t);
     F4 projected = (t + dr::sqrt(dr::fmadd(t, t, c.variance))) * ie;
+    // CUDA's root is approximate: below the horizon it may be less than -t
+    if constexpr (dr::is_cuda_v<Float>)
+        projected = dr::maximum(projected, 0.f);
     if (at.media)
         projected =
             dr::select(at.in_medium, F4(1.f), projected) * attenuation(at, F4(e2 * ie));
