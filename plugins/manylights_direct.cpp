@@ -118,14 +118,15 @@ lights there are. **It works less well**
 - for very few lights, or lights of equal importance, where Mitsuba's :monosp:`direct` does
   the same with less arithmetic.
 
-**Learning visibility.** A sixteenth of the samples is rendered in a first pass. For each cell of
-space and each node of the tree its shadow rays are counted: those that were traced to lights
-below each of its children, and the share :math:`v` of them that arrived. Later samples weight
-:math:`h`, :math:`H` and :math:`g` by :math:`\max(\sqrt{v}, 0.1)`. If much is hidden, a second
-sixteenth is counted as well; if nothing is, the rest is rendered as usual. All samples count in
+**Learning visibility.** A first pass has :math:`2^{16}` samples, rounded up to some of each pixel,
+but at most a sixteenth of all (or one of each pixel). For each cell of space and each node of the
+tree its shadow rays are counted: those that were traced to lights below each of its children, and
+the share :math:`v` of them that arrived. Later samples weight :math:`h`, :math:`H` and :math:`g` by
+:math:`\max(\sqrt{v}, 0.1)`. If much is hidden, the rays of a second pass of this size are counted
+as well; if nothing is, the rest is rendered as usual. All samples count in
 the image, which stays unbiased, and the same seed gives the same bits. The table takes at most 38
 MB. Nothing is learnt from fewer than four samples per pixel, from images with fewer than
-:math:`2^{19}` samples in LLVM variants or :math:`2^{24}` in CUDA variants, where another pass costs
+:math:`2^{19}` samples in LLVM variants or :math:`2^{23}` in CUDA variants, where another pass costs
 more than it gains, where all lights are considered anyway, and while differentiating; an
 integrator that is nested in others which only ask it for samples uses what it has kept, and learns
 nothing. What was kept is dropped with the integrator: load another one to start anew.
