@@ -117,6 +117,15 @@ def test_images_without_variance():
     assert not tools.compare_means(0 * a, a).passes
 
 
+@pytest.mark.parametrize("light, passes", [(1e-10, True), (1e-7, False)])
+def test_light_that_only_one_estimator_finds(light, passes):
+    """A billionth of the image mean is black, a little more in one tile is found."""
+    a, b = synthetic_images(2), synthetic_images(3)
+    a[:, :8, :8] = 0.0
+    b[:, :8, :8] = light
+    assert tools.compare_means(a, b).passes is passes
+
+
 def test_values_that_are_not_finite_are_refused():
     """One bad pixel in one rendering is reported."""
     a, b = synthetic_images(0), synthetic_images(1)

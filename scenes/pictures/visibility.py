@@ -18,7 +18,6 @@ import matplotlib.pyplot as plt
 
 mi.set_variant("llvm_ad_rgb")
 LUMINANCE = [0.2126, 0.7152, 0.0722]
-EXPECTED = 5  # the channel, after three of colour and two of counts
 
 
 def channels(scene: mi.Scene, learn) -> tuple[np.ndarray, np.ndarray]:
@@ -27,7 +26,8 @@ def channels(scene: mi.Scene, learn) -> tuple[np.ndarray, np.ndarray]:
     integrator = mi.load_dict(props)
     for seed in range(2):
         image = np.array(mi.render(scene, integrator=integrator, spp=256, seed=seed))
-    return image[..., :3] @ LUMINANCE, image[..., EXPECTED]
+    added = integrator.aov_names()
+    return image[..., :3] @ LUMINANCE, image[..., added.index("expected") - len(added)]
 
 
 def main() -> None:
