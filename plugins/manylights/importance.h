@@ -33,7 +33,7 @@ template <typename Float> struct Receiver {
     Vector3f n, wi;
     /// Can light arrive from behind as well?
     Mask transmits;
-    /// Reflectance off the lobe, peak of the lobe times alpha^2, and alpha^2 (GGX)
+    /// BSDF off the lobe; the lobe (see below): its peak times alpha^2, and alpha^2 (GGX)
     Float diffuse, specular, alpha2;
     /// Is this a point in a medium, without a cosine? Its extinction, where that is constant
     Mask in_medium;
@@ -64,24 +64,44 @@ Value attenuation(const Receiver<Float> &at, const Value &distance) {
     return dr::maximum(dr::exp(-distance * at.extinction), kTransmittanceFloor);
 }
 
+/// Share of its peak that a lobe has everywhere: for what one lobe does not tell of a BSDF
+constexpr float kLobeFloor = .0003f;
+/// How a lobe vanishes at grazing angles: sine of the angle up to which masking matters,
+/// over alpha
+constexpr float kMasking = .5f;
+
+/// Masking of a lobe towards a direction with the cosine c
+template <typename Float, typename Value>
+Value masking(const Value &c, const Float &alpha2) {
+    return dr::minimum(c * ((1.f / kMasking) * dr::rsqrt(alpha2)), 1.f);
+}
+
 /**
- * Reflectance of the measured lobe towards the direction w / |w|, widened by the angle that
- * a cluster of the given variance fills:
+ * The measured BSDF times the cosine c towards the direction w / |w|, which is a cluster's
+ * of variance s^2:
  *
- *     diffuse + peak alpha^2 a / ((n.h)^2 (a - 1) + 1)^2,   a = alpha^2 + variance / (2 e^2)
+ *     diffuse c + specular min(2 c / alpha, 1) a / ((n.h)^2 (a - 1) + 1)^2
+ *     a = alpha^2 + 2 (s / e)^2 / |wi + w / e|^2
  *
- * with h the half vector, (n.h)^2 = (n.w / e + n.wi)^2 / (2 + 2 wi.w / e).
+ * with h the half vector, (n.h)^2 = (n.w / e + n.wi)^2 / |wi + w / e|^2.
+ *
+ * A microfacet lobe D F G / (4 cos_i cos_o) has no cosine left once it is multiplied with
+ * cos_o, and the angle that a cluster fills is magnified in its half vector at grazing angles.
+ * With the lobe times c, a = alpha^2 + (s / e)^2 / 2 and a floor of .01, `city` had 1.8
+ * (1,000 points) and 1.6 times the variance (1,000 triangles), twelve materials under 1,000
+ * points 1.6 times in the geometric mean (.95 to 4).
  */
 template <typename Float, typename Value>
 Value lobe(const Receiver<Float> &at, const Value &cos_o, const Value &dot_wi,
-           const Value &spread2) {
-    Float cos_i = dr::dot(at.n, at.wi);
-    // Both terms over |wi + w / e|^2: one division
+           const Value &spread2, const Value &c) {
+    Float cos_i   = dr::dot(at.n, at.wi);
     Value length2 = dr::fmadd(dot_wi, 2.f, 2.001f),
           cos2    = dr::minimum(dr::square(cos_o + cos_i), length2);
-    Value a       = dr::minimum(dr::fmadd(spread2, .5f, at.alpha2), 1.f);
-    Value d       = length2 / dr::fmadd(cos2, a - 1.f, length2);
-    return dr::fmadd(a * at.specular, d * d, at.diffuse);
+    // All over |wi + w / e|^2: one division
+    Value a = dr::minimum(dr::fmadd(length2, at.alpha2, 2.f * spread2), length2);
+    Value r = dr::rcp(dr::fmadd(cos2, a - length2, dr::square(length2)));
+    Value d = a * length2 * dr::square(length2 * r);
+    return dr::fmadd(at.specular * masking(c, at.alpha2), d, at.diffuse * c);
 }
 
 /// The part of a wide node that the importance needs, for its four children
@@ -192,8 +212,8 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
  * above it. Siblings are compared, so that constant factors do not matter. The second factor is that of \ref emission.
- * In scenes with glossy surfaces h is multiplied with the receiver's \ref lobe. In a medium
- * there is no cosine, and h has the \ref attenuation. For segments see
+ * In scenes with glossy surfaces the receiver's \ref lobe takes the place of c / e. In a
+ * medium there is no cosine, and h has the \ref attenuation. For segments see
  * \ref segment_importance.
  */
 template <typename Float>
@@ -213,14 +233,16 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
     if constexpr (dr::is_cuda_v<Float>)
         projected = dr::maximum(projected, 0.f);
     if (at.media)
-        projected =
-            dr::select(at.in_medium, F4(1.f), projected) * attenuation(at, F4(e2 * ie));
-    F4 importance = c.flux * ie2 * projected;
+        projected = dr::select(at.in_medium, F4(1.f), projected);
     if (at.glossy) {
         F4 dot_wi =
             dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
-        importance *= lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2));
+        projected = lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2),
+                         F4(.5f * projected));
     }
+    F4 importance = c.flux * ie2 * projected;
+    if (at.media)
+        importance *= attenuation(at, F4(e2 * ie));
     if (directions != Directions::All)
         importance *= emission(c, wx, wy, wz, ie, directions);
     if (at.extent == Extent::Either)
@@ -380,19 +402,19 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
         a = look(nearest);
     }
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
-    Float t      = dr::dot(at.n, a.w);
-    t            = dr::select(at.transmits, dr::abs(t), t);
-    Float cosine = .5f * (t + dr::sqrt(t * t + a.variance)) * inv_d;
+    Float t = dr::dot(at.n, a.w);
+    t       = dr::select(at.transmits, dr::abs(t), t);
+    Float reflected =
+        dr::maximum(.5f * (t + dr::sqrt(t * t + a.variance)) * inv_d, kCosineFloor);
     if (at.media)
-        cosine =
-            dr::select(at.in_medium, 1.f, cosine) * attenuation(at, Float(d2 * inv_d));
-    Float reflectance(1.f);
+        reflected = dr::select(at.in_medium, 1.f, reflected);
     if (at.glossy)
-        reflectance =
-            lobe(at, Float(dr::dot(at.n, a.w) * inv_d),
-                 Float(dr::dot(at.wi, a.w) * inv_d), Float(a.variance * inv_d * inv_d));
-    return row[kBrightness] * a.intensity * dr::maximum(cosine, kCosineFloor) * inv_d *
-           inv_d * reflectance;
+        reflected = lobe(at, Float(dr::dot(at.n, a.w) * inv_d),
+                         Float(dr::dot(at.wi, a.w) * inv_d),
+                         Float(a.variance * inv_d * inv_d), reflected);
+    if (at.media)
+        reflected *= attenuation(at, Float(d2 * inv_d));
+    return row[kBrightness] * a.intensity * reflected * inv_d * inv_d;
 }
 
 } // namespace manylights

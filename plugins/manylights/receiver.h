@@ -87,14 +87,15 @@ private:
         auto [peak, density] = bsdf->eval_pdf(ctx, si, mirror, active);
         Spectrum base        = bsdf->eval(ctx, si, aside, active);
         FloatD cosine        = dr::maximum(dr::abs(plain(cos_i)), 1e-3f);
-        FloatD off = target(base) * 2.f, on = target(peak) / cosine;
+        FloatD off = target(base) * 2.f, on = target(peak);
         FloatD alpha2 =
             dr::rcp(4.f * dr::Pi<FloatD> * cosine *
                     dr::maximum(plain(density) - cosine * dr::InvPi<FloatD>, .05f));
-        at.alpha2   = dr::clip(alpha2, 1e-5f, 1.f);
-        at.specular = dr::maximum(on - off, 0.f) * at.alpha2;
+        at.alpha2 = dr::clip(alpha2, 1e-5f, 1.f);
+        at.specular =
+            dr::maximum(on - off * cosine, 0.f) * at.alpha2 / masking(cosine, at.alpha2);
         // The share that the lobe never takes away
-        at.diffuse = off + .01f * on + 1e-6f;
+        at.diffuse = off + kLobeFloor * on / cosine + 1e-6f;
     }
 };
 
