@@ -298,6 +298,18 @@ def edge_on():
     return scene(lamps)
 
 
+def wet_street():
+    """Points above a floor whose lobe points into the distance."""
+    shiny = {
+        "type": "roughplastic",
+        "distribution": "ggx",
+        "alpha": 0.15,
+        "diffuse_reflectance": rgb([0.05] * 3),
+    }
+    lights = points(500, low=(-3, -2, 0.2), high=(3, 8, 3))
+    return scene(lights, bsdf=shiny, size=0.1, origin=(0, -2, 0.4))
+
+
 def hair_above():
     """A lamp a thousandth above the floor, seen from the gap, and points."""
     lid = lamp(transform().translate([0, 0, 1e-3]).rotate([1, 0, 0], 180).scale(0.2), 1.0)
@@ -500,6 +512,9 @@ CASES = {
     ),
     "huge-and-tiny-specular": Case(
         "the same on nearly specular metal", huge_and_tiny(0.02), plain=False, variance=2
+    ),
+    "wet-street": Case(
+        "a shiny floor, nearly from the side", wet_street, plain=False, variance=0.43
     ),
     "hair-above": Case("a lamp 1/1000 above the floor", hair_above, plain=False, variance=0.0077),
     "one-texel": Case("emission from one texel of a bitmap", one_texel, plain=False, variance=9.5),
