@@ -86,7 +86,7 @@ public:
                        inside,
                        u,
                        effort(first),
-                       m_lights.glossy() && !m_all,
+                       m_lights.glossy() && !(m_all && m_keep_all),
                        Extent::Point,
                        active };
         find_cell(vertex);
