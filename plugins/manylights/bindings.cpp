@@ -27,18 +27,12 @@ using Rng     = drjit::PCG32<uint32_t>;
 using Choices = std::pair<std::vector<uint32_t>, std::vector<float>>;
 
 Receiver<float> receiver(const Place &p, const Place &n, bool transmits) {
-    mitsuba::Vector<float, 3> normal(n(0), n(1), n(2));
-    return { { p(0), p(1), p(2) },
-             normal,
-             normal,
-             transmits,
-             1.f,
-             0.f,
-             1.f,
-             false,
-             0.f,
-             0.f,
-             0.f };
+    auto at = drjit::zeros<Receiver<float>>();
+    at.p    = { p(0), p(1), p(2) };
+    at.n = at.wi = { n(0), n(1), n(2) };
+    at.transmits = transmits;
+    at.diffuse = at.alpha2 = 1.f;
+    return at;
 }
 
 SplitFunction split_function(const std::string &name) {
