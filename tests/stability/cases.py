@@ -511,7 +511,7 @@ CASES = {
         variance=0.041,
     ),
     "huge-and-tiny-specular": Case(
-        "the same on nearly specular metal", huge_and_tiny(0.02), plain=False, variance=2
+        "the same on nearly specular metal", huge_and_tiny(0.02), plain=False, variance=0.65
     ),
     "wet-street": Case(
         "a shiny floor, nearly from the side", wet_street, plain=False, variance=0.43
