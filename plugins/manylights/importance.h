@@ -33,7 +33,7 @@ template <typename Float> struct Receiver {
     Vector3f n, wi;
     /// Can light arrive from behind as well?
     Mask transmits;
-    /// BSDF off the lobe; the lobe (see below): its peak times alpha^2, and alpha^2 (GGX)
+    /// BSDF off the lobe; BSDF times cosine at its peak, times alpha^2; and alpha^2 (GGX)
     Float diffuse, specular, alpha2;
     /// Is this a point in a medium, without a cosine? Its extinction, where that is constant
     Mask in_medium;
