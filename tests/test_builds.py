@@ -53,9 +53,9 @@ def run_python(script, *arguments, **environment):
         check=False,
     )
     assert process.returncode == 0, process.stdout + process.stderr
-    # Mitsuba's log may leave a colour code at the beginning of the line
-    line = process.stdout.splitlines()[-1]
-    return json.loads(re.sub("\x1b\\[[0-9;]*m", "", line))
+    # Mitsuba's log may leave a colour code at the beginning of the line, or on one of its own
+    text = re.sub("\x1b\\[[0-9;]*m", "", process.stdout)
+    return json.loads(text.strip().splitlines()[-1])
 
 
 @pytest.mark.usefixtures("plugin")
