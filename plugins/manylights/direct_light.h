@@ -86,7 +86,7 @@ public:
                        inside,
                        u,
                        effort(first),
-                       m_lights.glossy() && !(m_all && m_keep_all),
+                       m_all && m_keep_all ? Lobes::None : m_lights.lobes(),
                        Extent::Point,
                        active };
         find_cell(vertex);
@@ -99,7 +99,7 @@ public:
                            const LightSample<Float> &u, const MaskD &first,
                            Mask active) const {
         Vertex vertex{ behind,        no_bsdf, &inside,         u,
-                       effort(first), false,   Extent::Segment, active };
+                       effort(first), Lobes::None, Extent::Segment, active };
         find_cell(vertex);
         return vertex;
     }
@@ -670,7 +670,7 @@ private:
             if (target_only) {
                 constexpr float typical_bsdf = .2f;
                 Float guess = Float(light_importance(vertex.at, row, kinds)) *
-                              (vertex.at.glossy ? 1.f : typical_bsdf);
+                              (vertex.at.lobes == Lobes::None ? typical_bsdf : 1.f);
                 dr::masked(result.value, other) =
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
             } else if (dr::any_or<true>(other)) {

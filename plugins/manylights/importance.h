@@ -22,6 +22,9 @@ namespace manylights {
 /// What a receiver is: known when kernels are recorded, except where paths look back
 enum class Extent { Point, Segment, Either };
 
+/// The lobes that BSDFs of a scene have
+enum class Lobes { None, Reflected, Transmitted /* as well */ };
+
 /// What a shading point shows to the tree
 template <typename Float> struct Receiver {
     using Vector3f = mitsuba::Vector<Float, 3>;
@@ -35,6 +38,10 @@ template <typename Float> struct Receiver {
     Mask transmits;
     /// BSDF off the lobe; BSDF times cosine at its peak, times alpha^2; and alpha^2 (GGX)
     Float diffuse, specular, alpha2;
+    /// Where most light comes from behind, through a rough surface; BSDF times cosine there,
+    /// times beta^2; and beta^2, for the lobe's solid angle pi beta^2
+    Vector3f through;
+    Float transmitted, beta2;
     /// Is this a point in a medium, without a cosine? Its extinction, where that is constant
     Mask in_medium;
     Float extinction;
@@ -43,12 +50,13 @@ template <typename Float> struct Receiver {
     /// Where visibility is learnt (visibility.h)
     dr::uint32_array_t<Float> cell;
 
-    DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, in_medium,
-                 extinction, length, distance, cell)
+    DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, through,
+                 transmitted, beta2, in_medium, extinction, length, distance, cell)
 
-    /// Which of the above are in use, the same for all receivers of a rendering: the lobe
+    /// Which of the above are in use, the same for all receivers of a rendering: the lobes
     /// and the medium. What is not costs nothing.
-    bool glossy = false, media = false;
+    Lobes lobes   = Lobes::None;
+    bool media    = false;
     Extent extent = Extent::Point;
 
     /// The part of a segment that may receive much light: some mean free paths
@@ -76,6 +84,38 @@ Value masking(const Value &c, const Float &alpha2) {
     return dr::minimum(c * ((1.f / kMasking) * dr::rsqrt(alpha2)), 1.f);
 }
 
+/// c + sqrt(c^2 + s^2): 2 max(c, 0), smoothed by a variance s^2
+template <typename Value> Value twice_positive(const Value &c, const Value &variance) {
+    Value result = c + dr::sqrt(dr::fmadd(c, c, variance));
+    // CUDA's root is approximate: below the horizon it may be less than -c
+    if constexpr (dr::is_cuda_v<Value>)
+        result = dr::maximum(result, 0.f);
+    return result;
+}
+
+/// What an observer of a lobe has to know of a light or a cluster at w, of variance s^2
+template <typename Value> struct LobeView {
+    /// n.w, wi.w and (with transmission) through.w, over e; s^2 / e^2
+    Value cos_o, dot_wi, dot_through, spread2;
+};
+
+/**
+ * Light that comes through a rough surface, whose lobe falls as GGX with the angle to its peak t:
+ *
+ *     transmitted b min(2 c / alpha, 1) / (b + |t - w / e|^2)^2,  b = beta^2 + 2 (s / e)^2
+ *
+ * with the cosine c on the other side. Without it, 1,000 points behind rough glass had X times
+ * the variance.
+ */
+template <typename Float, typename Value>
+Value transmitted_lobe(const Receiver<Float> &at, const LobeView<Value> &view) {
+    Value b      = dr::fmadd(view.spread2, 2.f, at.beta2),
+          chord2 = dr::maximum(dr::fnmadd(view.dot_through, 2.f, 2.f), 0.f),
+          c      = twice_positive(Value(-view.cos_o), view.spread2);
+    return at.transmitted * masking(Value(.5f * c), at.alpha2) * b *
+           dr::square(dr::rcp(b + chord2));
+}
+
 /**
  * The measured BSDF times the cosine c towards the direction w / |w|, which is a cluster's
  * of variance s^2:
@@ -92,16 +132,19 @@ Value masking(const Value &c, const Float &alpha2) {
  * points 1.6 times in the geometric mean (.88 to 4.2).
  */
 template <typename Float, typename Value>
-Value lobe(const Receiver<Float> &at, const Value &cos_o, const Value &dot_wi,
-           const Value &spread2, const Value &c) {
+Value lobe(const Receiver<Float> &at, const LobeView<Value> &view, const Value &c) {
     Float cos_i   = dr::dot(at.n, at.wi);
-    Value length2 = dr::fmadd(dot_wi, 2.f, 2.001f),
-          cos2    = dr::minimum(dr::square(cos_o + cos_i), length2);
+    Value length2 = dr::fmadd(view.dot_wi, 2.f, 2.001f),
+          cos2    = dr::minimum(dr::square(view.cos_o + cos_i), length2);
     // All over |wi + w / e|^2: one division
-    Value a = dr::minimum(dr::fmadd(length2, at.alpha2, 2.f * spread2), length2);
+    Value a = dr::minimum(dr::fmadd(length2, at.alpha2, 2.f * view.spread2), length2);
     Value r = dr::rcp(dr::fmadd(cos2, a - length2, dr::square(length2)));
     Value d = a * length2 * dr::square(length2 * r);
-    return dr::fmadd(at.specular * masking(c, at.alpha2), d, at.diffuse * c);
+    if (at.lobes == Lobes::Reflected)
+        return dr::fmadd(at.specular * masking(c, at.alpha2), d, at.diffuse * c);
+    Value front = .5f * twice_positive(view.cos_o, view.spread2);
+    return dr::fmadd(at.specular * masking(front, at.alpha2), d,
+                     dr::fmadd(at.diffuse, c, transmitted_lobe(at, view)));
 }
 
 /// The part of a wide node that the importance needs, for its four children
@@ -226,19 +269,19 @@ Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> 
     F4 e2 = dr::fmadd(wx, wx, dr::fmadd(wy, wy, dr::fmadd(wz, wz, c.variance)));
     F4 ie = dr::rsqrt(e2), ie2 = ie * ie;
 
-    F4 t = dr::fmadd(wx, F4(at.n.x()), dr::fmadd(wy, F4(at.n.y()), wz * at.n.z()));
-    t    = dr::select(at.transmits, dr::abs(t), t);
-    F4 projected = (t + dr::sqrt(dr::fmadd(t, t, c.variance))) * ie;
-    // CUDA's root is approximate: below the horizon it may be less than -t
-    if constexpr (dr::is_cuda_v<Float>)
-        projected = dr::maximum(projected, 0.f);
+    auto dot = [&](const auto &d) {
+        return dr::fmadd(wx, F4(d.x()), dr::fmadd(wy, F4(d.y()), wz * d.z()));
+    };
+    F4 t = dot(at.n);
+    F4 projected =
+        twice_positive(F4(dr::select(at.transmits, dr::abs(t), t)), c.variance) * ie;
     if (at.media)
         projected = dr::select(at.in_medium, F4(1.f), projected);
-    if (at.glossy) {
-        F4 dot_wi =
-            dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
-        projected = lobe(at, F4(t * ie), F4(dot_wi * ie), F4(c.variance * ie2),
-                         F4(.5f * projected));
+    if (at.lobes != Lobes::None) {
+        LobeView<F4> view{ t * ie, dot(at.wi) * ie, F4(0.f), c.variance * ie2 };
+        if (at.lobes == Lobes::Transmitted)
+            view.dot_through = dot(at.through) * ie;
+        projected = lobe(at, view, F4(.5f * projected));
     }
     F4 importance = c.flux * ie2 * projected;
     if (at.media)
@@ -402,16 +445,18 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
         a = look(nearest);
     }
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
-    Float t = dr::dot(at.n, a.w);
-    t       = dr::select(at.transmits, dr::abs(t), t);
-    Float reflected =
-        dr::maximum(.5f * (t + dr::sqrt(t * t + a.variance)) * inv_d, kCosineFloor);
+    Float t     = dr::dot(at.n, a.w);
+    Float twice = twice_positive(Float(dr::select(at.transmits, dr::abs(t), t)), a.variance);
+    Float reflected = dr::maximum(.5f * twice * inv_d, kCosineFloor);
     if (at.media)
         reflected = dr::select(at.in_medium, 1.f, reflected);
-    if (at.glossy)
-        reflected = lobe(at, Float(dr::dot(at.n, a.w) * inv_d),
-                         Float(dr::dot(at.wi, a.w) * inv_d),
-                         Float(a.variance * inv_d * inv_d), reflected);
+    if (at.lobes != Lobes::None) {
+        LobeView<Float> view{ t * inv_d, dr::dot(at.wi, a.w) * inv_d, Float(0.f),
+                              a.variance * inv_d * inv_d };
+        if (at.lobes == Lobes::Transmitted)
+            view.dot_through = dr::dot(at.through, a.w) * inv_d;
+        reflected = lobe(at, view, reflected);
+    }
     if (at.media)
         reflected *= attenuation(at, Float(d2 * inv_d));
     return row[kBrightness] * a.intensity * reflected * inv_d * inv_d;

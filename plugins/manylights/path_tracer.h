@@ -292,7 +292,7 @@ private:
             dr::masked(s.from, plain(along)) = piece.along;
             dr::masked(s.u_tree, along)      = piece.u_tree;
         }
-        s.from.glossy = vertex.at.glossy;
+        s.from.lobes  = vertex.at.lobes;
         s.from.media  = vertex.at.media;
         s.from.extent = m_segments ? Extent::Either : Extent::Point;
     }

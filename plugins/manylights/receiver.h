@@ -31,17 +31,22 @@ public:
         return dr::select(g > 0.f && dr::isfinite(g), dr::minimum(g, 1e25f), 0.f);
     }
 
-    /// The lobe is measured only if the scene has any: it costs two evaluations of the BSDF
+    /// Lobes are measured only if the scene has any: each costs two evaluations of the BSDF
     static void read(Receiver<FloatD> &at, const SurfaceInteraction3f &si,
-                     const BSDFPtr &bsdf, bool glossy, Mask active) {
-        Mask transmits = has_flag(bsdf->flags(active), mitsuba::BSDFFlags::Transmission);
+                     const BSDFPtr &bsdf, Lobes lobes, Mask active) {
+        auto flags     = bsdf->flags(active);
+        Mask transmits = has_flag(flags, mitsuba::BSDFFlags::Transmission);
         Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
         at.p           = plain(si.p);
         at.n           = plain(n);
         at.wi          = plain(si.to_world(si.wi));
         at.transmits   = plain(transmits);
-        if (glossy)
+        if (lobes != Lobes::None)
             measure_lobe(si, bsdf, at, active);
+        if (lobes == Lobes::Transmitted)
+            measure_transmission(
+                si, bsdf, at,
+                active && has_flag(flags, mitsuba::BSDFFlags::GlossyTransmission));
     }
 
     /// The medium around a surface, or a point or a segment in the medium: no cosine, no lobe
@@ -64,6 +69,7 @@ public:
         dr::masked(at.n, here)        = 0.f;
         dr::masked(at.diffuse, here)  = 1.f;
         dr::masked(at.specular, here) = 0.f;
+        dr::masked(at.transmitted, here) = 0.f;
     }
 
 private:
@@ -96,6 +102,31 @@ private:
             dr::maximum(on - off * cosine, 0.f) * at.alpha2 / masking(cosine, at.alpha2);
         // The share that the lobe never takes away
         at.diffuse = off + kLobeFloor * on / cosine + 1e-6f;
+    }
+
+    /**
+     * The lobe of transmission: the BSDF finds its middle, where its density is about
+     * 1 / (pi beta^2).
+     */
+    MI_NOINLINE static void measure_transmission(const SurfaceInteraction3f &si,
+                                                 const BSDFPtr &bsdf,
+                                                 Receiver<FloatD> &at, Mask active) {
+        if (dr::none_or<false>(active))
+            return;
+        dr::suspend_grad<Float> detached;
+        mitsuba::BSDFContext through, ctx;
+        through.type_mask = +mitsuba::BSDFFlags::GlossyTransmission;
+        auto bs = bsdf->sample(through, si, Float(.5f), Point2f(.5f), active).first;
+        active &= bs.pdf > 0.f &&
+                  has_flag(bs.sampled_type, mitsuba::BSDFFlags::GlossyTransmission);
+        auto [peak, density] = bsdf->eval_pdf(ctx, si, bs.wo, active);
+        FloatD on            = dr::select(plain(active), target(peak), 0.f);
+        FloatD beta2         = dr::rcp(dr::Pi<FloatD> * plain(density));
+        at.beta2             = dr::select(plain(active), dr::clip(beta2, 1e-5f, 4.f), 1.f);
+        at.through           = plain(si.to_world(bs.wo));
+        at.transmitted       = on * at.beta2;
+        FloatD cosine = dr::maximum(dr::abs(plain(Frame3f::cos_theta(bs.wo))), 1e-3f);
+        at.diffuse += kLobeFloor * on / cosine;
     }
 };
 

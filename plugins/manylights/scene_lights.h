@@ -97,7 +97,7 @@ public:
         m_can_be_hit         = table.can_be_hit;
         m_tree.kinds         = table.kinds;
         m_tree.directions    = directions(table);
-        m_glossy             = any_glossy(scene);
+        m_lobes              = find_lobes(scene);
         m_media              = Media<Float, Spectrum>::find(scene);
         m_tree.light_count   = (uint32_t) table.rows.size();
 
@@ -180,7 +180,7 @@ public:
         // The same emitters may belong to another scene: a new one that lies in memory
         // where a deleted one lay
         MediaKinds media = Media<Float, Spectrum>::find(scene);
-        result.mix_common(4 * any_glossy(scene) + 2 * media.homogeneous +
+        result.mix_common(4 * (uint32_t) find_lobes(scene) + 2 * media.homogeneous +
                           media.heterogeneous);
         return result;
     }
@@ -230,8 +230,8 @@ public:
         m_visibility.reset();
     }
 
-    /// Has any surface a glossy lobe?
-    bool glossy() const { return m_glossy; }
+    /// The lobes that its surfaces have
+    Lobes lobes() const { return m_lobes; }
     /// Kinds of light that are sampled from the table
     KindSet table_kinds() const {
         return { m_tree.kinds.bits & ~(1u << (uint32_t) LightKind::Other) };
@@ -288,12 +288,18 @@ private:
         return Directions::All;
     }
 
-    static bool any_glossy(const Scene *scene) {
-        for (const auto &shape : scene->shapes())
-            if (shape->bsdf() &&
-                has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Glossy))
-                return true;
-        return false;
+    static Lobes find_lobes(const Scene *scene) {
+        Lobes result = Lobes::None;
+        for (const auto &shape : scene->shapes()) {
+            if (!shape->bsdf())
+                continue;
+            uint32_t flags = shape->bsdf()->flags();
+            if (has_flag(flags, mitsuba::BSDFFlags::GlossyTransmission))
+                return Lobes::Transmitted;
+            if (has_flag(flags, mitsuba::BSDFFlags::Glossy))
+                result = Lobes::Reflected;
+        }
+        return result;
     }
 
     class Stopwatch {
@@ -411,7 +417,8 @@ private:
     std::vector<bool> m_proportional;
     std::vector<const Emitter *> m_infinite;
     mitsuba::DynamicBuffer<EmitterPtr> m_infinite_dr;
-    bool m_needs_emitter_eval = false, m_can_be_hit = false, m_glossy = false;
+    bool m_needs_emitter_eval = false, m_can_be_hit = false;
+    Lobes m_lobes = Lobes::None;
     MediaKinds m_media;
     Statistics m_statistics;
 };
