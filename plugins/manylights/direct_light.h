@@ -98,7 +98,7 @@ public:
                            const typename Vertex::InMedium &inside,
                            const LightSample<Float> &u, const MaskD &first,
                            Mask active) const {
-        Vertex vertex{ behind,        no_bsdf, &inside,         u,
+        Vertex vertex{ behind,        no_bsdf,     &inside,         u,
                        effort(first), Lobes::None, Extent::Segment, active };
         find_cell(vertex);
         return vertex;

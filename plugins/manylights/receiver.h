@@ -66,10 +66,11 @@ public:
         at.p              = dr::select(at.length > 0.f, plain(inside.start),
                                        dr::select(here, plain(inside.mei.p), at.p));
         at.wi             = dr::select(here, plain(inside.mei.wi), at.wi);
-        dr::masked(at.n, here)        = 0.f;
-        dr::masked(at.diffuse, here)  = 1.f;
-        dr::masked(at.specular, here) = 0.f;
+        dr::masked(at.n, here)           = 0.f;
+        dr::masked(at.diffuse, here)     = 1.f;
+        dr::masked(at.specular, here)    = 0.f;
         dr::masked(at.transmitted, here) = 0.f;
+        dr::masked(at.alpha2, here)      = 1.f;
     }
 
 private:
@@ -122,11 +123,11 @@ private:
         auto [peak, density] = bsdf->eval_pdf(ctx, si, bs.wo, active);
         FloatD on            = dr::select(plain(active), target(peak), 0.f);
         FloatD beta2         = dr::rcp(dr::Pi<FloatD> * plain(density));
-        at.beta2             = dr::select(plain(active), dr::clip(beta2, 1e-5f, 4.f), 1.f);
-        at.through           = plain(si.to_world(bs.wo));
-        at.transmitted       = on * at.beta2;
-        FloatD cosine = dr::maximum(dr::abs(plain(Frame3f::cos_theta(bs.wo))), 1e-3f);
-        at.diffuse += kLobeFloor * on / cosine;
+        at.beta2       = dr::select(plain(active), dr::clip(beta2, 1e-5f, 4.f), 1.f);
+        at.through     = dr::select(plain(active), plain(si.to_world(bs.wo)), 0.f);
+        at.transmitted = on * at.beta2;
+        FloatD cosine  = dr::maximum(dr::abs(plain(Frame3f::cos_theta(bs.wo))), 1e-3f);
+        at.diffuse += kThroughFloor * at.transmitted / cosine;
     }
 };
 
