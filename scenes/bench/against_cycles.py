@@ -28,12 +28,11 @@ from pathlib import Path
 from typing import IO
 
 import drjit as dr
-import manylights
 import mitsuba as mi
 import numpy as np
-from manylights.bench import metrics
+from manylights.bench import metrics, scene_source
 
-SIZE = {"width": 256, "height": 144}
+WIDTH, HEIGHT = 256, 144
 THREADS, SEEDS, SAMPLES = 2, 8, 64
 SCENES = (
     "open_plane:1000", "open_plane:10000", "city:1000,kind=points", "city:10000,kind=points",
@@ -42,12 +41,10 @@ SCENES = (
 )  # fmt: skip
 
 
-def generate(text: str) -> dict:
-    """Return the description of a scene that is named as on the command line."""
-    call, *options = text.split(",")
-    name, lights = call.split(":")
-    arguments = dict(option.split("=") for option in options)
-    return getattr(manylights.scenes, name)(int(lights), **arguments, **SIZE)
+def load(text: str) -> mi.Scene:
+    """Load a scene that is named as for `manylights bench`; radiances are attributes of faces."""
+    texture = ",texture=false" if text.split(":")[0] in scene_source.TEXTURED else ""
+    return scene_source.find(f"{text},width={WIDTH},height={HEIGHT}{texture}").load().scene
 
 
 def rounded(radiance: np.ndarray) -> np.ndarray:
@@ -104,7 +101,7 @@ def export(scene: mi.Scene, path: Path) -> None:
     # Mitsuba's cameras look along z with x to the left, Blender's along -z with x to the right
     matrix = np.array(camera["to_world"].matrix).reshape(4, 4) @ np.diag([-1.0, 1.0, -1.0, 1.0])
     data["camera"], data["fov"] = matrix, np.radians(float(np.ravel(camera["x_fov"])[0]))
-    data["size"] = (SIZE["width"], SIZE["height"])
+    data["size"] = (WIDTH, HEIGHT)
     np.savez(path, **data)
 
 
@@ -202,7 +199,7 @@ def main() -> None:
         folder = Path(name)
         blender = Blender(python, folder, log)
         for text in scenes or SCENES:
-            scene = mi.load_dict(generate(text))
+            scene = load(text)
             export(scene, folder / "scene.npz")
             blender.load(folder / "scene.npz")
             print(table_row(text, measure(blender, scene)), flush=True)
