@@ -46,6 +46,9 @@ METHODS = (
 MAX_DEPTH = 4
 """Default path depth of the tests: three bounces."""
 
+RARE = ("fog-not-spectral",)
+"""A lamp next to a line of sight has rare bright samples, which the short pilots do not see."""
+
 
 def parameter_id(parameters):
     """A readable test id: `reservoirs=4,shadow_rays=1`."""
@@ -57,10 +60,6 @@ def quick_and_slow(values, quick):
     return [
         pytest.param(value, marks=[] if value in quick else [pytest.mark.slow]) for value in values
     ]
-
-
-RARE = ("fog-not-spectral",)
-"""A lamp next to a line of sight has rare bright samples, which the short pilots do not see."""
 
 
 def light_tree(**parameters):

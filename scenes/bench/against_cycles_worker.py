@@ -43,9 +43,10 @@ class Nodes:
                 node.inputs[name].default_value = value
         return node
 
-    def mix(self, factor, first, second):
-        node = self.tree.nodes.new("ShaderNodeMixShader")
-        for index, socket in enumerate((factor, first, second)):
+    def join(self, kind: str, *sockets):
+        """Link sockets to the inputs of a new node, in their order."""
+        node = self.tree.nodes.new(kind)
+        for index, socket in enumerate(sockets):
             self.tree.links.new(socket, node.inputs[index])
         return node.outputs[0]
 
@@ -71,7 +72,9 @@ def surface(name: str, color, lobe):
     glossy = nodes.add("ShaderNodeBsdfAnisotropic", Color=WHITE, Roughness=np.sqrt(alpha))
     glossy.distribution = "GGX"
     fresnel = nodes.add("ShaderNodeFresnel", IOR=eta)
-    return nodes.finish(nodes.mix(fresnel.outputs[0], diffuse, glossy.outputs[0]))
+    return nodes.finish(
+        nodes.join("ShaderNodeMixShader", fresnel.outputs[0], diffuse, glossy.outputs[0])
+    )
 
 
 def emitter(name: str, radiance):
@@ -83,7 +86,9 @@ def emitter(name: str, radiance):
     ).outputs[0]
     black = nodes.add("ShaderNodeBsdfDiffuse", Color=BLACK).outputs[0]
     geometry = nodes.add("ShaderNodeNewGeometry")
-    material = nodes.finish(nodes.mix(geometry.outputs["Backfacing"], shine, black))
+    material = nodes.finish(
+        nodes.join("ShaderNodeMixShader", geometry.outputs["Backfacing"], shine, black)
+    )
     material.cycles.emission_sampling = "FRONT"
     return material
 
@@ -93,10 +98,8 @@ def fog(name: str, extinction: float, albedo: float):
     nodes = Nodes(name)
     scatter = nodes.add("ShaderNodeVolumeScatter", Color=WHITE, Density=albedo * extinction)
     absorb = nodes.add("ShaderNodeVolumeAbsorption", Color=BLACK, Density=(1 - albedo) * extinction)
-    both = nodes.tree.nodes.new("ShaderNodeAddShader")
-    for index, node in enumerate((scatter, absorb)):
-        nodes.tree.links.new(node.outputs[0], both.inputs[index])
-    return nodes.finish(both.outputs[0], "Volume")
+    both = nodes.join("ShaderNodeAddShader", scatter.outputs[0], absorb.outputs[0])
+    return nodes.finish(both, "Volume")
 
 
 def add_mesh(name: str, vertices, faces):
