@@ -27,6 +27,7 @@
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/integrator.h>
 #include <mitsuba/render/sampler.h>
+#include <variant>
 
 namespace manylights {
 
@@ -62,6 +63,9 @@ public:
         m_slots    = m_keep_all ? std::min((uint32_t) most, count) : params.reservoirs;
         m_items    = m_slots + infinite_items();
         m_choose   = !params.traces_all() && m_items > params.shadow_rays_deeper();
+        m_keeps_samples = !dr::is_jit_v<Float> && m_choose && !media.any &&
+                          !lights.needs_emitter_eval() &&
+                          !lights.tree().kinds.has(LightKind::Other);
     }
 
     const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
@@ -204,19 +208,26 @@ private:
         DRJIT_STRUCT(Sample, value, p, from)
     };
     using InfiniteSamples = std::array<Sample, kMaxInfinite>;
+    using KeptSamples =
+        std::conditional_t<dr::is_jit_v<Float>, std::monostate, FixedArray<Sample>>;
 
     /// The lights that reach stage 3, at most one in each slot
     struct Kept {
         Slots<UInt32D> light;
         /// Contribution weight C (0: empty), inclusion probability, target g
         Slots<FloatD> weight, probability, target;
+        /// What the targets are of, see \ref m_keeps_samples
+        KeptSamples sample;
         DRJIT_STRUCT(Kept, light, weight, probability, target)
 
         explicit Kept(size_t slots, size_t items)
             : light(make_slots<UInt32D>(slots, 0u)),
               weight(make_slots<FloatD>(slots, 0.f)),
               probability(make_slots<FloatD>(slots, 1.f)),
-              target(make_slots<FloatD>(items, 0.f)) {}
+              target(make_slots<FloatD>(items, 0.f)) {
+            if constexpr (!dr::is_jit_v<Float>)
+                sample = KeptSamples(slots, dr::zeros<Sample>());
+        }
     };
 
     // --------------------------------------------------------------- Stages 1 and 2
@@ -279,9 +290,9 @@ private:
                 write_slot<FloatD>(kept.weight, s.slot, weight, m_slots, valid);
                 write_slot<FloatD>(kept.probability, s.slot, p, m_slots, valid);
                 if (m_choose) {
-                    FloatD g =
-                        light_target(vertex, candidate.light, p, s.slot, active && valid);
-                    g *= candidate.visibility;
+                    FloatD g = light_target(vertex, candidate.light, p, s.slot, kept,
+                                            active && valid) *
+                               candidate.visibility;
                     if (m_params.counts)
                         s.expected +=
                             expected_light(weight * g, candidate.visibility, valid);
@@ -360,7 +371,7 @@ private:
                 FloatD target =
                     light_target(vertex, read_slot<UInt32D>(kept.light, s.slot, m_slots),
                                  read_slot<FloatD>(kept.probability, s.slot, m_slots),
-                                 s.slot, active && weight > 0.f);
+                                 s.slot, kept, active && weight > 0.f);
                 FloatD visibility =
                     read_slot<FloatD>(reservoirs.visibility, s.slot, m_slots);
                 target *= visibility;
@@ -514,11 +525,8 @@ private:
             UInt32D slot  = dr::minimum(chosen.item, m_slots - 1u);
             FloatD weight = read_slot<FloatD>(kept.weight, slot, m_slots);
             Mask finite   = active && chosen.item < m_slots && weight > 0.f;
-            sample        = sample_light_point(
-                vertex, read_slot<UInt32D>(kept.light, slot, m_slots),
-                read_slot<FloatD>(kept.probability, slot, m_slots), slot,
-                /* target_only = */ false, finite);
-            sample.value = sample.value * Float(weight) & finite;
+            sample        = kept_sample(vertex, kept, slot, finite);
+            sample.value  = sample.value * Float(weight) & finite;
         }
         for (size_t i = 0; i < infinite_items(); ++i)
             sample = dr::select(active && chosen.item == (uint32_t) (m_slots + i),
@@ -536,6 +544,17 @@ private:
                       Reader::target(result) > least, traced);
         }
         return result;
+    }
+
+    /// F / p of what is in a slot
+    Sample kept_sample(const Vertex &vertex, const Kept &kept, const UInt32D &slot,
+                       Mask active) const {
+        if constexpr (!dr::is_jit_v<Float>)
+            if (m_keeps_samples)
+                return kept.sample[slot];
+        return sample_light_point(vertex, read_slot<UInt32D>(kept.light, slot, m_slots),
+                                  read_slot<FloatD>(kept.probability, slot, m_slots),
+                                  slot, /* target_only = */ false, active);
     }
 
     /// Where visibility is learnt and looked up, see \ref VisibilityTable::cell
@@ -574,9 +593,13 @@ private:
 
     /// |F| of a light's point
     FloatD light_target(const Vertex &vertex, const UInt32D &light,
-                        const FloatD &inclusion, const UInt32D &slot, Mask active) const {
+                        const FloatD &inclusion, const UInt32D &slot, Kept &kept,
+                        Mask active) const {
         Sample sample = sample_light_point(vertex, light, inclusion, slot,
                                            /* target_only = */ true, active);
+        if constexpr (!dr::is_jit_v<Float>)
+            if (m_keeps_samples)
+                kept.sample[slot] = sample;
         FloatD target = Reader::target(sample.value);
         if (vertex.at.media) {
             bool segment = vertex.at.extent == Extent::Segment;
@@ -821,6 +844,12 @@ private:
     const SamplingParameters &m_params;
     /// Is every light a candidate? Is every candidate kept? Are there more than shadow rays?
     bool m_all, m_keep_all, m_choose;
+    /**
+     * Are samples kept for the rays that their targets choose, instead of being computed again?
+     * In scalar variants this takes .93 to .95 of the time (1,000 points, 10,000 triangles), in
+     * LLVM variants, where slots are written with a selection each, .96 to 1.04.
+     */
+    bool m_keeps_samples;
     /// Is something known of the lights' visibility, or to be learnt?
     bool m_learns;
     /// Places for kept lights, and these together with the lights at infinity
