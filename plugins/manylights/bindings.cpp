@@ -84,17 +84,19 @@ public:
     /// Probability that one random descent ends at each light
     std::vector<float> probabilities(const Place &p, const Place &n,
                                      bool transmits) const {
+        auto at = receiver(p, n, transmits);
+        TopWeights<float>(m_view, at);
         return for_each_light([&](uint32_t light) {
-            return leaf_probability<float>(m_view, receiver(p, n, transmits), light,
-                                           true);
+            return leaf_probability<float>(m_view, at, light, true);
         });
     }
 
     /// Systematic sampling: candidates for the random number u
     Choices candidates(const Place &p, const Place &n, float expected, float u,
                        uint64_t seed, bool transmits) const {
-        return collect(SystematicCursor<float>(expected, u), receiver(p, n, transmits),
-                       seed);
+        auto at = receiver(p, n, transmits);
+        TopWeights<float> top(m_view, at);
+        return collect(SystematicCursor<float>(top, expected, u), at, seed);
     }
 
     /// Splitting of nodes for the random number xi
@@ -169,6 +171,7 @@ private:
 
     void load_nodes() {
         m_view.nodes = load(m_wide.data(), m_wide.size() * kWideNodeFloats);
+        m_view.top   = TopView<float>(read_top(m_wide.data()));
     }
 
     static drjit::DynamicArray<float> load(const void *data, size_t size) {

@@ -37,6 +37,8 @@ template <typename Float> struct Candidate {
 constexpr float kBelowOne = 0x1.fffffep-1f;
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
 constexpr float kMaxExpectedCandidates = 1 << 14;
+/// Nodes that \ref TopWeights looks at
+constexpr uint32_t kTopNodes = 4;
 /// K for a splitting rate of 1
 constexpr float kCandidatesPerRate = 8.f;
 
@@ -68,8 +70,8 @@ template <typename Float> struct AllLights {
  * whole traversal and the probability of splitting decreases with depth, as in the talk,
  * but N' <= K always.
  *
- * Every point descends from the root, or from one of two remembered nodes known to hold
- * the next point ("trail"): no stack, and all SIMD lanes stay alike. A trail that
+ * Every point descends from the top of the tree, which has been compared once for all of
+ * them, or from one of two remembered nodes known to hold the next point ("trail"): no stack, and all SIMD lanes stay alike. A trail that
  * overflows costs time only.
  */
 template <typename Float> struct SystematicCursor {
@@ -92,9 +94,12 @@ template <typename Float> struct SystematicCursor {
     UInt32 last_leaf, visits;
     DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1, last_leaf, visits)
 
-    SystematicCursor(const Float &expected, const Float &u)
-        : expected(expected), offset(u), k(0.f), trail0(root(0.f)), trail1(root(0.f)),
-          last_leaf(kNone), visits(0) {}
+    /// The same for all points
+    TopWeights<Float> top;
+
+    SystematicCursor(const TopWeights<Float> &top, const Float &expected, const Float &u)
+        : expected(expected), offset(u), k(0.f), trail0(nowhere()), trail1(nowhere()),
+          last_leaf(kNone), visits(kTopNodes), top(top) {}
 
     Mask has_next() const { return k + offset < expected; }
 
@@ -108,11 +113,11 @@ template <typename Float> struct SystematicCursor {
             DRJIT_STRUCT(Descent, place, trail0, trail1, x, dither, visits)
         };
 
-        // By rounding, a remembered node may miss the point by a hair: then start at the root
+        // By rounding, a remembered node may miss the point by a hair: then start at the top
         Mask remembered = holds(trail0, k);
-        Descent d{ dr::select(remembered, trail0, root(expected)),
-                   dr::select(remembered, trail1, root(0.f)),
-                   root(0.f),
+        Descent d{ dr::select(remembered, trail0, below_top(tree, at)),
+                   dr::select(remembered, trail1, nowhere()),
+                   nowhere(),
                    Float(0.f),
                    rng.template next_float<Float>(),
                    visits };
@@ -134,8 +139,33 @@ template <typename Float> struct SystematicCursor {
     }
 
 private:
-    static Place root(const Float &width) {
-        return { UInt32(0), Float(0.f), width, Float(1.f) };
+    static Place nowhere() { return { UInt32(0), Float(0.f), Float(0.f), Float(1.f) }; }
+
+    /// The grandchild of the root on which the point falls
+    Place below_top(const TreeView<Float> &tree, const Receiver<Float> &at) const {
+        Float scale = expected / at.top_total,
+              x     = dr::minimum((k + offset) / expected, kBelowOne) * at.top_total;
+        Float begin(0.f), weight = top.weight[0].entry(0), before(0.f);
+        UInt32 child = tree.top.child[0].entry(0), index(0);
+        for (uint32_t i = 0; i < 16; ++i) {
+            // Never an empty slot, see choose_child
+            if (i > 0) {
+                Mask take = x >= before;
+                child     = dr::select(take, tree.top.child[i / 4].entry(i % 4), child);
+                begin     = dr::select(take, before, begin);
+                weight    = dr::select(take, top.weight[i / 4].entry(i % 4), weight);
+                index     = dr::select(take, UInt32(i), index);
+            }
+            before = top.end[i / 4].entry(i % 4);
+        }
+        Place place{ child, begin * scale, weight * scale, Float(1.f) };
+        if (tree.visibility) {
+            UInt32 group = index >> 2u, node = tree.top.node[0];
+            for (uint32_t i = 1; i < 4; ++i)
+                node = dr::select(group == i, tree.top.node[i], node);
+            place.visibility = pick<Float>(tree.top_factors(at, group, node), index & 3u);
+        }
+        return place;
     }
 
     /// Does point k, which is not in front of a place, lie in its interval?
@@ -162,11 +192,10 @@ private:
         if (visibility)
             child.visibility = visibility->factor(choice.slot, s.place.visibility);
 
-        // Remember this node if it holds a point beyond the child (the root needs no place)
-        Mask push =
-            s.place.node != 0u && holds(s.place, next_point(child.begin + child.width));
-        s.trail1 = dr::select(push, s.trail0, s.trail1);
-        s.trail0 = dr::select(push, s.place, s.trail0);
+        // Remember this node if it holds a point beyond the child
+        Mask push = holds(s.place, next_point(child.begin + child.width));
+        s.trail1  = dr::select(push, s.trail0, s.trail1);
+        s.trail0  = dr::select(push, s.place, s.trail0);
 
         s.x = (x - choice.begin) / choice.weight;
         /* A descent magnifies the rounding of x. Where the interval becomes too small for a

@@ -93,7 +93,7 @@ public:
                        m_all && m_keep_all ? Lobes::None : m_lights.lobes(),
                        Extent::Point,
                        active };
-        find_cell(vertex);
+        look_at_tree(vertex);
         return vertex;
     }
 
@@ -104,7 +104,7 @@ public:
                            Mask active) const {
         Vertex vertex{ behind,        no_bsdf,     &inside,         u,
                        effort(first), Lobes::None, Extent::Segment, active };
-        find_cell(vertex);
+        look_at_tree(vertex);
         return vertex;
     }
 
@@ -248,7 +248,8 @@ private:
             return keep(AllLights<FloatD>(dr::opaque<UInt32D>(light_count())));
         if (m_params.splits_nodes())
             return keep(splitting_cursor(vertex.at, u.tree));
-        return keep(SystematicCursor<FloatD>(vertex.effort.candidates, u.tree));
+        return keep(
+            SystematicCursor<FloatD>(vertex.top, vertex.effort.candidates, u.tree));
     }
 
     uint32_t light_count() const { return m_lights.tree().light_count; }
@@ -557,13 +558,16 @@ private:
                                   slot, /* target_only = */ false, active);
     }
 
-    /// Where visibility is learnt and looked up, see \ref VisibilityTable::cell
-    void find_cell(Vertex &vertex) const {
-        if (!m_learns)
-            return;
-        auto bits = seed_bits(plain_sample(vertex.u));
-        vertex.at.cell =
-            m_lights.tree().visibility->cell(vertex.at, bits.first, bits.second);
+    /// What all traversals for a vertex have in common: the cell where visibility is learnt and
+    /// looked up (\ref VisibilityTable::cell), and the weights at the top
+    void look_at_tree(Vertex &vertex) const {
+        const auto &tree = m_lights.tree();
+        if (m_learns) {
+            auto bits      = seed_bits(plain_sample(vertex.u));
+            vertex.at.cell = tree.visibility->cell(vertex.at, bits.first, bits.second);
+        }
+        if (!m_all && !m_params.splits_nodes())
+            vertex.top = TopWeights<FloatD>(tree, vertex.at);
     }
 
     Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,

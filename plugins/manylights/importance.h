@@ -49,9 +49,12 @@ template <typename Float> struct Receiver {
     Float length, distance;
     /// Where visibility is learnt (visibility.h)
     dr::uint32_array_t<Float> cell;
+    /// Sum of h, and of all weights, at the top of the tree (\ref TopWeights)
+    Float top_importance, top_total;
 
     DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, through,
-                 transmitted, beta2, in_medium, extinction, length, distance, cell)
+                 transmitted, beta2, in_medium, extinction, length, distance, cell,
+                 top_importance, top_total)
 
     /// Which of the above are in use, the same for all receivers of a rendering: the lobes
     /// and the medium. What is not costs nothing.

@@ -102,11 +102,14 @@ public:
         m_tree.light_count   = (uint32_t) table.rows.size();
 
         HostStorage<Storage> nodes;
-        auto node_memory = [&](size_t count) {
-            return (WideNode *) nodes.allocate(count * kWideNodeFloats);
+        WideNode *nodes_begin = nullptr;
+        auto node_memory      = [&](size_t count) {
+            return nodes_begin = (WideNode *) nodes.allocate(count * kWideNodeFloats);
         };
         LightTree tree = build_tree(std::move(table.bounds), node_memory, keep_binary);
-        m_tree.nodes   = or_empty(nodes.close());
+        if (tree.wide_count > 0)
+            m_tree.top = TopView<FloatD>(read_top(nodes_begin));
+        m_tree.nodes = or_empty(nodes.close());
         // Never empty either
         tree.node_link.push_back(kNone);
         m_tree.node_links =
@@ -359,6 +362,7 @@ private:
         if (!valid)
             return false;
         refit_tree(nodes, m_statistics.nodes, fluxes);
+        m_tree.top   = TopView<FloatD>(read_top(nodes));
         m_tree.rows  = row_storage.close();
         m_tree.nodes = node_storage.close();
         return true;

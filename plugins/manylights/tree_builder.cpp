@@ -623,6 +623,32 @@ void refit_tree(WideNode *nodes, size_t count, const HostVector<float> &flux) {
     run_with_denormals([&] { Refit(nodes, count, flux).run(0, count); });
 }
 
+TreeTop read_top(const WideNode *nodes) {
+    TreeTop top{};
+    const WideNode &root = nodes[0];
+    for (uint32_t group = 0; group < 4; ++group) {
+        uint32_t child       = root.child[group];
+        bool single          = child == 0 || child & kLeafBit;
+        top.node[group]      = single ? 0 : child;
+        const WideNode &node = nodes[top.node[group]];
+        top.share[group]     = single ? 1.f : unpack_flux<float>(root.moments[group]);
+        for (uint32_t slot = 0; slot < 4; ++slot) {
+            // Empty slots are as far away as the first one
+            uint32_t from = single ? group : slot;
+            bool empty    = child == 0 || (single && slot > 0);
+            for (int i = 0; i < 3; ++i) {
+                top.mean[group][i][slot] = node.mean[i][from];
+                top.axis[group][i][slot] = unpack_axis<float>(node.axis[from], i);
+            }
+            top.variance[group][slot] = unpack_variance<float>(node.moments[from]);
+            top.flux[group][slot] =
+                empty ? 0.f : unpack_flux<float>(node.moments[from]) * top.share[group];
+            top.child[group][slot] = empty ? 0 : node.child[from];
+        }
+    }
+    return top;
+}
+
 uint32_t pack_moments(float flux, float variance) {
     auto upper = [](float x) { // does not round up to infinity
         uint32_t bits = dr::reinterpret_array<uint32_t>(std::min(x, 0x1.fep127f));

@@ -51,6 +51,20 @@ static_assert(sizeof(WideNode) == kWideNodeFloats * sizeof(float));
 constexpr uint32_t kLeafBit = 0x80000000u;
 
 /**
+ * The top of the tree: the root's grandchildren, unpacked, in four groups of four. A light
+ * that hangs at the root is alone in its group.
+ */
+struct TreeTop {
+    float mean[4][3][4], variance[4][4], axis[4][3][4];
+    /// As a fraction of the whole tree's, 0 in an empty slot
+    float flux[4][4];
+    uint32_t child[4][4];
+    /// Node that the group is in (0: the root), and its fraction of the flux
+    uint32_t node[4];
+    float share[4];
+};
+
+/**
  * A node of the binary tree that the method `talk` walks, in depth-first order: the left
  * child is the next node. `escape` is the node that follows this whole subtree.
  */
@@ -98,6 +112,9 @@ LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
  * `flux` has an entry for each light, positive, in any unit.
  */
 void refit_tree(WideNode *nodes, size_t count, const HostVector<float> &flux);
+
+/// Read the top of a tree that has nodes
+TreeTop read_top(const WideNode *nodes);
 
 /// Upper halves of two floats, rounded to nearest: flux (never rounded to 0) and variance
 uint32_t pack_moments(float flux, float variance);

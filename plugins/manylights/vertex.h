@@ -5,6 +5,7 @@
  * light is the same computation for both; only what differs is asked of the vertex.
  */
 
+#include "light_tree.h"
 #include "media.h"
 #include "parameters.h"
 #include "segment.h"
@@ -83,6 +84,8 @@ template <typename Float, typename Spectrum> struct Vertex {
     Effort<FloatD> effort;
     /// As the tree sees it
     Receiver<FloatD> at;
+    /// Where descents of the tree begin, if it has one
+    TopWeights<FloatD> top;
     /// On a segment: density of free flights over that of the chosen distance, so that light
     /// sampling and phase sampling are compared as densities of distance and direction
     Float flight_ratio = Float(1.f);

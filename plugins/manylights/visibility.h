@@ -75,6 +75,11 @@ template <typename Float> struct ChildVisibility {
         return dr::select(word != 0u, Four<Float>(bytes), 1.f);
     }
 
+    /// The same, comparable with other nodes: `above` if nothing is known
+    Four<Float> factors(const Float &above) const {
+        return dr::select(word != 0u, factors() * (1.f / 255.f), Four<Float>(above));
+    }
+
     /// The factor of one child, or `above` if nothing is known
     Float factor(const UInt32 &slot, const Float &above) const {
         return dr::select(word != 0u, Float((word >> (8u * slot)) & 255u) * (1.f / 255.f),
