@@ -201,7 +201,10 @@ constexpr float kNarrowestBeam = 1e-3f;
 /**
  * Emission in the direction -w / |w|, where inv_norm is 1 / e, relative to its mean.
  *
- * Broad: first harmonics. Beams: a von Mises-Fisher lobe about the axis whose
+ * Broad: the first harmonics, the last one with 3/4 in place of the 5/8 of a cosine, so that less
+ * is left where all lights of a cluster are seen edge-on: 60 lamps in the plane of the receiver
+ * have .008 in place of .016 of relative variance, 1,000 and 10,000 triangles of a city .98 and
+ * 1.02 times that of 5/8 (with 1: 1.05 and 1.15 times). Beams: a von Mises-Fisher lobe about the axis whose
  * concentration k follows from the axis' length r (Banerjee et al. 2005) and from the
  * angle that the cluster fills:
  *
@@ -217,7 +220,7 @@ Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
     F4 r2 = dr::fmadd(c.axis[0], c.axis[0],
                       dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
     if (directions == Directions::Broad)
-        return dr::maximum(1.f + 2.f * o + .625f * (3.f * o * o - r2), kEmissionFloor);
+        return dr::maximum(1.f + 2.f * o + .75f * (3.f * o * o - r2), kEmissionFloor);
     F4 inv_r = dr::rsqrt(r2 + 1e-8f),
        spread =
            (1.f - r2) * inv_r * dr::rcp(3.f - r2) + c.variance * dr::square(inv_norm),
@@ -254,7 +257,7 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
  * h of four clusters at once:
  *
  *     w = mean - x,  e^2 = |w|^2 + variance
- *     h = flux / e^2 * c / e * max(1 + 2 o + 5/8 (3 o^2 - |a|^2), floor)
+ *     h = flux / e^2 * c / e * max(1 + 2 o + 3/4 (3 o^2 - |a|^2), floor)
  *     c = n.w + sqrt((n.w)^2 + variance)      2 max(n.w, 0), smoothed
  *     o = -a.w / e                            a: mean emission axis
  *
