@@ -301,8 +301,8 @@ def test_render_merges_the_lamps_of_a_scene_file(scalar, tmp_path):
     assert set(bsdfs) == {"floor", "merged_3_emitters"}
     assert bsdfs["floor"] is bsdfs["merged_3_emitters"]
     ours = mi.load_dict({"type": "manylights_direct"})
-    a = tools.render_seeds(loaded.scene, ours, 64, range(16))
-    b = tools.render_seeds(mi.load_file(path), ours, 64, range(100, 116))
+    a = tools.render_seeds(loaded.scene, ours, 128, range(16))
+    b = tools.render_seeds(mi.load_file(path), ours, 128, range(100, 116))
     tools.assert_same_mean(a, b, label="render")
 
 
