@@ -71,8 +71,8 @@ template <typename Float> struct AllLights {
  * but N' <= K always.
  *
  * Every point descends from the top of the tree, which has been compared once for all of
- * them, or from one of two remembered nodes known to hold the next point ("trail"): no stack, and all SIMD lanes stay alike. A trail that
- * overflows costs time only.
+ * them, or from one of two remembered nodes known to hold the next point ("trail"): no
+ * stack, and all SIMD lanes stay alike. A trail that overflows costs time only.
  */
 template <typename Float> struct SystematicCursor {
     using UInt32 = dr::uint32_array_t<Float>;
