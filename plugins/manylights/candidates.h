@@ -94,12 +94,13 @@ template <typename Float> struct SystematicCursor {
     UInt32 last_leaf, visits;
     DRJIT_STRUCT(SystematicCursor, expected, offset, k, trail0, trail1, last_leaf, visits)
 
-    /// The same for all points
+    /// The same for all points; and points for a unit of its weights
     TopWeights<Float> top;
+    Float scale;
 
     SystematicCursor(const TopWeights<Float> &top, const Float &expected, const Float &u)
         : expected(expected), offset(u), k(0.f), trail0(nowhere()), trail1(nowhere()),
-          last_leaf(kNone), visits(kTopNodes), top(top) {}
+          last_leaf(kNone), visits(kTopNodes), top(top), scale(expected / top.total()) {}
 
     Mask has_next() const { return k + offset < expected; }
 
@@ -143,27 +144,17 @@ private:
 
     /// The grandchild of the root on which the point falls
     Place below_top(const TreeView<Float> &tree, const Receiver<Float> &at) const {
-        Float scale = expected / at.top_total,
-              x     = dr::minimum((k + offset) / expected, kBelowOne) * at.top_total;
-        Float begin(0.f), weight = top.weight[0].entry(0), before(0.f);
-        UInt32 child = tree.top.child[0].entry(0), index(0);
-        for (uint32_t i = 0; i < 16; ++i) {
-            // Never an empty slot, see choose_child
-            if (i > 0) {
-                Mask take = x >= before;
-                child     = dr::select(take, tree.top.child[i / 4].entry(i % 4), child);
-                begin     = dr::select(take, before, begin);
-                weight    = dr::select(take, top.weight[i / 4].entry(i % 4), weight);
-                index     = dr::select(take, UInt32(i), index);
-            }
-            before = top.end[i / 4].entry(i % 4);
-        }
-        Place place{ child, begin * scale, weight * scale, Float(1.f) };
-        if (tree.visibility) {
-            UInt32 group = index >> 2u, node = tree.top.node[0];
+        Float x = dr::minimum((k + offset) / expected, kBelowOne) * top.total();
+        ChildChoice<Float> choice =
+            choose_child<Float, kTopClusters>(top, tree.top.child, x);
+        Place place{ choice.child, choice.begin * scale, choice.weight * scale,
+                     Float(1.f) };
+        if (top.root) {
+            UInt32 group = choice.slot >> 2u, node = tree.top.node[0];
             for (uint32_t i = 1; i < 4; ++i)
                 node = dr::select(group == i, tree.top.node[i], node);
-            place.visibility = pick<Float>(tree.top_factors(at, group, node), index & 3u);
+            place.visibility = pick<Float>(tree.top_factors(at, *top.root, group, node),
+                                           choice.slot & 3u);
         }
         return place;
     }
@@ -182,11 +173,12 @@ private:
     void descend(const TreeView<Float> &tree, const Receiver<Float> &at,
                  Descent &s) const {
         WideNodeView<Float> node(tree, s.place.node, true);
-        auto visibility             = tree.child_visibility(at, s.place.node);
-        ChildWeights<Float> weights = child_weights(tree, at, node.clusters, visibility);
-        Float x                     = s.x * weights.total();
-        ChildChoice<Float> choice   = choose_child(weights, node.child, x);
-        Float scale                 = s.place.width / weights.total();
+        auto visibility = tree.child_visibility(at, s.place.node);
+        ClusterWeights<Float, 4> weights =
+            child_weights(tree, at, node.clusters, visibility);
+        Float x                   = s.x * weights.total();
+        ChildChoice<Float> choice = choose_child(weights, node.child, x);
+        Float scale               = s.place.width / weights.total();
         Place child{ choice.child, dr::fmadd(choice.begin, scale, s.place.begin),
                      choice.weight * scale, s.place.visibility };
         if (visibility)
@@ -386,8 +378,8 @@ private:
                 clusters.axis[i].entry(slot) = unpack_axis<Float>(axis, i);
         }
         clusters.flux /= clusters.flux.entry(0) + clusters.flux.entry(1);
-        ChildWeights<Float> weights = child_weights(tree, at, clusters, {});
-        return weights.weight.entry(0) / weights.total();
+        ClusterWeights<Float, 4> weights = child_weights(tree, at, clusters, {});
+        return weights.weight[0] / weights.total();
     }
 };
 

@@ -93,7 +93,7 @@ public:
                        m_all && m_keep_all ? Lobes::None : m_lights.lobes(),
                        Extent::Point,
                        active };
-        look_at_tree(vertex);
+        look_at_tree(vertex, active);
         return vertex;
     }
 
@@ -104,7 +104,7 @@ public:
                            Mask active) const {
         Vertex vertex{ behind,        no_bsdf,     &inside,         u,
                        effort(first), Lobes::None, Extent::Segment, active };
-        look_at_tree(vertex);
+        look_at_tree(vertex, active);
         return vertex;
     }
 
@@ -220,13 +220,14 @@ private:
         KeptSamples sample;
         DRJIT_STRUCT(Kept, light, weight, probability, target)
 
-        explicit Kept(size_t slots, size_t items)
+        explicit Kept(size_t slots, size_t items, bool keeps_samples)
             : light(make_slots<UInt32D>(slots, 0u)),
               weight(make_slots<FloatD>(slots, 0.f)),
               probability(make_slots<FloatD>(slots, 1.f)),
               target(make_slots<FloatD>(items, 0.f)) {
             if constexpr (!dr::is_jit_v<Float>)
-                sample = KeptSamples(slots, dr::zeros<Sample>());
+                if (keeps_samples)
+                    sample = KeptSamples(slots, dr::zeros<Sample>());
         }
     };
 
@@ -277,7 +278,7 @@ private:
                 : cursor(cursor), kept(std::move(kept)), rng(std::move(rng)), slot(0),
                   expected(0.f) {}
         };
-        State state(cursor, Kept(m_slots, m_items), make_rng(u));
+        State state(cursor, Kept(m_slots, m_items, m_keeps_samples), make_rng(u));
         MaskD on = plain(active);
         loop(
             state,
@@ -355,7 +356,7 @@ private:
             FloatD expected;
             DRJIT_STRUCT(State, slot, target, expected)
         };
-        Kept kept(m_slots, m_items);
+        Kept kept(m_slots, m_items, m_keeps_samples);
         kept.light       = reservoirs.light;
         kept.probability = reservoirs.probability;
         for (size_t i = 0; i < m_slots; ++i)
@@ -560,7 +561,9 @@ private:
 
     /// What all traversals for a vertex have in common: the cell where visibility is learnt and
     /// looked up (\ref VisibilityTable::cell), and the weights at the top
-    void look_at_tree(Vertex &vertex) const {
+    void look_at_tree(Vertex &vertex, Mask active) const {
+        if (dr::none_or<false>(vertex.is_lit(active)))
+            return;
         const auto &tree = m_lights.tree();
         if (m_learns) {
             auto bits      = seed_bits(plain_sample(vertex.u));

@@ -13,6 +13,7 @@
 #include "importance.h"
 #include "tree_builder.h"
 #include "visibility.h"
+#include <array>
 #include <drjit/dynamic.h>
 #include <optional>
 
@@ -22,12 +23,15 @@ namespace manylights {
 /// over-estimates can then not starve its neighbours
 constexpr float kDefensiveShare = .05f;
 
+/// Clusters at the top, in groups of four
+constexpr size_t kTopClusters = 16;
+
 /// \ref TreeTop as kernels see it: the same for all receivers
 template <typename Float> struct TopView {
     using UInt32 = dr::uint32_array_t<Float>;
 
     Clusters<Float> clusters[4];
-    dr::Array<UInt32, 4> child[4];
+    dr::Array<UInt32, kTopClusters> child;
     UInt32 node[4];
     Float share[4];
 
@@ -49,7 +53,8 @@ template <typename Float> struct TopView {
             c.variance = four(top.variance[group]);
             c.flux     = four(top.flux[group]);
             for (size_t slot = 0; slot < 4; ++slot)
-                child[group].entry(slot) = dr::opaque<UInt32>(top.child[group][slot]);
+                child.entry(4 * group + slot) =
+                    dr::opaque<UInt32>(top.child[group][slot]);
             node[group]  = dr::opaque<UInt32>(top.node[group]);
             share[group] = dr::opaque<Float>(top.share[group]);
         }
@@ -102,10 +107,10 @@ template <typename Float> struct TreeView {
     }
 
     /// The same for a group at the top (\ref TreeTop), which is in that node: comparable with
-    /// those of others, since what is not known of it is that of the root's child
-    Four<Float> top_factors(const Receiver &at, const UInt32 &group,
-                            const UInt32 &node) const {
-        Float above = visibility->children(at.cell, UInt32(0)).factor(group, Float(1.f));
+    /// those of others, since what is not known of it is that of the `root`'s child
+    Four<Float> top_factors(const Receiver &at, const ChildVisibility<Float> &root,
+                            const UInt32 &group, const UInt32 &node) const {
+        Float above = root.factor(group, Float(1.f));
         return dr::select(node != 0u, visibility->children(at.cell, node).factors(above),
                           Four<Float>(above));
     }
@@ -161,13 +166,24 @@ private:
     }
 };
 
-/// Weights of the four children of a node, to which their probabilities are proportional
-template <typename Float> struct ChildWeights {
-    dr::Array<Float, 4> weight;
-    /// [0, end[0]) belongs to the first child, [end[0], end[1]) to the second, ...
-    dr::Array<Float, 4> end;
+/// Weights of N clusters that are compared with each other: their probabilities are
+/// proportional to them
+template <typename Float, size_t N> struct ClusterWeights {
+    std::array<Float, N> weight;
+    /// [0, end[0]) belongs to the first cluster, [end[0], end[1]) to the second, ...
+    std::array<Float, N> end;
 
-    Float total() const { return end.entry(3); }
+    Float total() const { return end[N - 1]; }
+
+    /// Put the next four behind the first `count`
+    void append(size_t count, const Four<Float> &four) {
+        Float sum = count > 0 ? end[count - 1] : Float(0.f);
+        for (size_t i = 0; i < 4; ++i) {
+            weight[count + i] = four.entry(i);
+            sum += four.entry(i);
+            end[count + i] = sum;
+        }
+    }
 };
 
 /**
@@ -206,9 +222,9 @@ template <typename Float> Float sum_of(const Four<Float> &v) {
     return (v.entry(0) + v.entry(1)) + (v.entry(2) + v.entry(3));
 }
 
-/// The weights of a node's children, which are compared with each other
+/// The weights of a node's children
 template <typename Float>
-ChildWeights<Float>
+ClusterWeights<Float, 4>
 child_weights(const TreeView<Float> &tree, const Receiver<Float> &at,
               const Clusters<Float> &clusters,
               const std::optional<ChildVisibility<Float>> &visibility) {
@@ -216,13 +232,8 @@ child_weights(const TreeView<Float> &tree, const Receiver<Float> &at,
     Four<Float> weight = defensive_weights<Float>(clusters.flux, h, sum_of<Float>(h));
     if (visibility)
         weight *= visibility->factors();
-    ChildWeights<Float> result;
-    Float end(0.f);
-    for (size_t i = 0; i < 4; ++i) {
-        result.weight.entry(i) = weight.entry(i);
-        end += weight.entry(i);
-        result.end.entry(i) = end;
-    }
+    ClusterWeights<Float, 4> result;
+    result.append(0, weight);
     return result;
 }
 
@@ -234,18 +245,18 @@ template <typename Float> struct ChildChoice {
 
 /// The last child that starts at or below `x` < total: never an empty slot, where both its
 /// ends are the total or those of the child before it
-template <typename Float>
-ChildChoice<Float> choose_child(const ChildWeights<Float> &weights,
-                                const dr::Array<dr::uint32_array_t<Float>, 4> &child,
+template <typename Float, size_t N>
+ChildChoice<Float> choose_child(const ClusterWeights<Float, N> &weights,
+                                const dr::Array<dr::uint32_array_t<Float>, N> &child,
                                 const Float &x) {
     using UInt32 = dr::uint32_array_t<Float>;
-    ChildChoice<Float> choice{ child.entry(0), 0u, Float(0.f), weights.weight.entry(0) };
-    for (size_t i = 1; i < 4; ++i) {
-        auto take     = x >= weights.end.entry(i - 1);
+    ChildChoice<Float> choice{ child.entry(0), 0u, Float(0.f), weights.weight[0] };
+    for (size_t i = 1; i < N; ++i) {
+        auto take     = x >= weights.end[i - 1];
         choice.child  = dr::select(take, child.entry(i), choice.child);
         choice.slot   = dr::select(take, UInt32((uint32_t) i), choice.slot);
-        choice.begin  = dr::select(take, weights.end.entry(i - 1), choice.begin);
-        choice.weight = dr::select(take, weights.weight.entry(i), choice.weight);
+        choice.begin  = dr::select(take, weights.end[i - 1], choice.begin);
+        choice.weight = dr::select(take, weights.weight[i], choice.weight);
     }
     return choice;
 }
@@ -259,15 +270,17 @@ ChildChoice<Float> choose_child(const ChildWeights<Float> &weights,
  * light in LLVM variants (.96 to 2.1), since its variance was higher and a sample took 1.03 to
  * 1.12 times as long; with paths of three bounces 1.05 to 1.11 times (four scenes).
  */
-template <typename Float> struct TopWeights {
+template <typename Float> struct TopWeights : ClusterWeights<Float, kTopClusters> {
     using UInt32 = dr::uint32_array_t<Float>;
 
-    dr::Array<Float, 4> weight[4], end[4];
+    /// What has been learnt of the root's children
+    std::optional<ChildVisibility<Float>> root;
 
     TopWeights() = default;
-    TopWeights(const TreeView<Float> &tree, Receiver<Float> &at) {
+    TopWeights(const TreeView<Float> &tree, Receiver<Float> &at)
+        : root(tree.child_visibility(at, UInt32(0))) {
         Four<Float> h[4];
-        Float importance(0.f), sum(0.f);
+        Float importance(0.f);
         for (size_t group = 0; group < 4; ++group) {
             h[group] = cluster_importance(at, tree.top.clusters[group], tree.directions);
             importance += sum_of<Float>(h[group]);
@@ -275,16 +288,13 @@ template <typename Float> struct TopWeights {
         for (size_t group = 0; group < 4; ++group) {
             Four<Float> w = defensive_weights<Float>(tree.top.clusters[group].flux,
                                                      h[group], importance);
-            if (tree.visibility)
-                w *= tree.top_factors(at, UInt32((uint32_t) group), tree.top.node[group]);
-            for (size_t i = 0; i < 4; ++i) {
-                weight[group].entry(i) = w.entry(i);
-                sum += w.entry(i);
-                end[group].entry(i) = sum;
-            }
+            if (root)
+                w *= tree.top_factors(at, *root, UInt32((uint32_t) group),
+                                      tree.top.node[group]);
+            this->append(4 * group, w);
         }
         at.top_importance = importance;
-        at.top_total      = sum;
+        at.top_total      = this->total();
     }
 };
 
@@ -306,6 +316,7 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
     // Upwards: the product does not care about the order, and parents are stored
     UInt32 link = dr::select(active, tree.row(light, active).bits(kLink), 0u);
     State state{ link, tree.parent_link(link >> 2u), Float(1.f), active };
+    auto root_visibility = tree.child_visibility(at, UInt32(0));
     loop(
         state, [](const State &s) { return s.active; },
         [&](State &s) {
@@ -321,9 +332,9 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
             Four<Float> weight = defensive_weights<Float>(
                 node.clusters.flux, h,
                 dr::select(top, at.top_importance, sum_of<Float>(h)));
-            if (tree.visibility)
-                weight *=
-                    tree.top_factors(at, dr::select(root, slot, s.above & 3u), index);
+            if (root_visibility)
+                weight *= tree.top_factors(at, *root_visibility,
+                                           dr::select(root, slot, s.above & 3u), index);
             Float total = dr::select(top, at.top_total, sum_of<Float>(weight));
             s.probability *= pick<Float>(weight, slot) / total;
             s.active &= !top;

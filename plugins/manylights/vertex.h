@@ -109,6 +109,13 @@ template <typename Float, typename Spectrum> struct Vertex {
         return inside ? Mask(active && !inside->here) : active;
     }
 
+    /// Can sampled lights reach it? Not on a mirror
+    Mask is_lit(Mask active) const {
+        Mask lit = on_surface(active);
+        lit      = lit && has_flag(bsdf->flags(), mitsuba::BSDFFlags::Smooth);
+        return inside ? Mask(lit || (active && inside->here)) : lit;
+    }
+
     /// Where its shadow rays start
     Interaction3f origin() const {
         Interaction3f it(si);
