@@ -207,9 +207,9 @@ public:
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
         auto vertex  = direct.prepare(si, bsdf, nullptr, u, true, active);
-        Mask smooth  = active && has_flag(bsdf->flags(), BSDFFlags::Smooth);
-        if (dr::any_or<true>(smooth))
-            result += direct.sample_lights(vertex, counts, smooth);
+        Mask lit     = vertex.is_lit(active);
+        if (dr::any_or<true>(lit))
+            result += direct.sample_lights(vertex, counts, lit);
         if (m_params.counts)
             counts.write(aovs, m_params);
         if (direct.needs_bsdf_samples())
