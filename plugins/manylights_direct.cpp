@@ -207,7 +207,7 @@ public:
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
         auto vertex  = direct.prepare(si, bsdf, nullptr, u, true, active);
-        Mask lit     = vertex.is_lit(active);
+        Mask lit     = vertex.is_lit_surface(active);
         if (dr::any_or<true>(lit))
             result += direct.sample_lights(vertex, counts, lit);
         if (m_params.counts)

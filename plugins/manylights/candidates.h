@@ -37,8 +37,6 @@ template <typename Float> struct Candidate {
 constexpr float kBelowOne = 0x1.fffffep-1f;
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
 constexpr float kMaxExpectedCandidates = 1 << 14;
-/// Nodes that \ref TopWeights looks at
-constexpr uint32_t kTopNodes = 4;
 /// K for a splitting rate of 1
 constexpr float kCandidatesPerRate = 8.f;
 

@@ -562,14 +562,15 @@ private:
     /// What all traversals for a vertex have in common: the cell where visibility is learnt and
     /// looked up (\ref VisibilityTable::cell), and the weights at the top
     void look_at_tree(Vertex &vertex, Mask active) const {
-        if (dr::none_or<false>(vertex.is_lit(active)))
+        bool top = !m_all && !m_params.splits_nodes();
+        if ((!top && !m_learns) || dr::none_or<false>(vertex.is_lit(active)))
             return;
         const auto &tree = m_lights.tree();
         if (m_learns) {
             auto bits      = seed_bits(plain_sample(vertex.u));
             vertex.at.cell = tree.visibility->cell(vertex.at, bits.first, bits.second);
         }
-        if (!m_all && !m_params.splits_nodes())
+        if (top)
             vertex.top = TopWeights<FloatD>(tree, vertex.at);
     }
 

@@ -204,9 +204,10 @@ constexpr float kNarrowestBeam = 1e-3f;
  * Broad: the first harmonics, the last one with 3/4 in place of the 5/8 of a cosine, so that less
  * is left where all lights of a cluster are seen edge-on: 60 lamps in the plane of the receiver
  * have .008 in place of .016 of relative variance, 1,000 and 10,000 triangles of a city .98 and
- * 1.02 times that of 5/8 (with 1: 1.05 and 1.15 times). Beams: a von Mises-Fisher lobe about the axis whose
- * concentration k follows from the axis' length r (Banerjee et al. 2005) and from the
- * angle that the cluster fills:
+ * 1.02 times that of 5/8 (with 1: 1.05 and 1.15 times).
+ *
+ * Beams: a von Mises-Fisher lobe about the axis whose concentration k follows from the axis'
+ * length r (Banerjee et al. 2005) and from the angle that the cluster fills:
  *
  *     1 / k = (1 - r^2) / (r (3 - r^2)) + variance / e^2
  *     2 k / (1 - exp(-2 k)) exp(k (o / r - 1))
@@ -262,10 +263,10 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
  *     o = -a.w / e                            a: mean emission axis
  *
  * The variance rounds the cosine: a cluster that straddles the horizon keeps what is
- * above it. Siblings are compared, so that constant factors do not matter. The second factor is that of \ref emission.
- * In scenes with glossy surfaces the receiver's \ref lobe takes the place of c / e. In a
- * medium there is no cosine, and h has the \ref attenuation. For segments see
- * \ref segment_importance.
+ * above it. Siblings are compared, so that constant factors do not matter. The last factor
+ * is that of \ref emission. In scenes with glossy surfaces the receiver's \ref lobe takes the
+ * place of c / e. In a medium there is no cosine, and h has the \ref attenuation. For segments
+ * see \ref segment_importance.
  */
 template <typename Float>
 Four<Float> cluster_importance(const Receiver<Float> &at, const Clusters<Float> &c,

@@ -23,8 +23,9 @@ namespace manylights {
 /// over-estimates can then not starve its neighbours
 constexpr float kDefensiveShare = .05f;
 
-/// Clusters at the top, in groups of four
-constexpr size_t kTopClusters = 16;
+/// Nodes that \ref TopWeights looks at, and their children
+constexpr uint32_t kTopNodes  = 4;
+constexpr size_t kTopClusters = 4 * kTopNodes;
 
 /// \ref TreeTop as kernels see it: the same for all receivers
 template <typename Float> struct TopView {

@@ -218,7 +218,7 @@ private:
 
     void add_direct_light(State &s, const Vertex &vertex, const Piece &piece,
                           Mask surface) const {
-        Mask lit = surface && has_flag(vertex.bsdf->flags(), mitsuba::BSDFFlags::Smooth);
+        Mask lit = vertex.is_lit_surface(surface);
         if (m_media) {
             lit &= !is_last(s) && dr::any(piece.seen != 0.f);
             Mask here = s.active && vertex.inside->here;

@@ -109,10 +109,15 @@ template <typename Float, typename Spectrum> struct Vertex {
         return inside ? Mask(active && !inside->here) : active;
     }
 
-    /// Can sampled lights reach it? Not on a mirror
+    /// Can sampled lights reach it on a surface? Not on a mirror
+    Mask is_lit_surface(Mask active) const {
+        Mask surface = on_surface(active);
+        return surface && has_flag(bsdf->flags(), mitsuba::BSDFFlags::Smooth);
+    }
+
+    /// The same on surfaces and in media
     Mask is_lit(Mask active) const {
-        Mask lit = on_surface(active);
-        lit      = lit && has_flag(bsdf->flags(), mitsuba::BSDFFlags::Smooth);
+        Mask lit = is_lit_surface(active);
         return inside ? Mask(lit || (active && inside->here)) : lit;
     }
 
