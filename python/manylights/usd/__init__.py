@@ -1,0 +1,1 @@
+"""USD stages as dictionaries for ``mi.load_dict``; needs ``pip install 'manylights[usd]'``."""
