@@ -150,6 +150,7 @@ public:
     MI_IMPORT_BASE(PathBase, m_max_depth, m_rr_depth, m_hide_emitters, m_params, m_cache)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium)
     using PathTracer = manylights::PathTracer<Float, Spectrum>;
+    using Media      = manylights::Media<Float, Spectrum>;
 
     ManyLightsVolpath(const Properties &props)
         : Base(props, manylights::read_path_parameters(props)) {}
@@ -158,9 +159,8 @@ public:
                                      const RayDifferential3f &ray, const Medium *medium,
                                      Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
-        const auto &lights           = m_cache.get(scene, sampler);
-        manylights::MediaKinds media = lights.media();
-        media.add(medium);
+        const auto &lights = m_cache.get(scene, sampler);
+        auto media         = Media::with(lights.media(), scene, medium);
         PathTracer tracer(scene, lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;

@@ -37,6 +37,44 @@ template <typename Float> Float mis_weight(const Float &pdf_a, const Float &pdf_
     return dr::select(dr::isfinite(w), w, 0.f);
 }
 
+/// A light sample without visibility: F / p, and where the shadow ray leads
+template <typename Float, typename Spectrum, bool Polarized> struct RaySample {
+    using Point3f = mitsuba::Point<Float, 3>;
+    Spectrum value;
+    Point3f p;
+    /// Where the ray starts, if that is a choice of the sample (segments)
+    Point3f from;
+    DRJIT_STRUCT(RaySample, value, p, from)
+
+    static RaySample make(const Spectrum &f, const Spectrum &emission, const Point3f &p,
+                          const Point3f &from) {
+        return { f * emission, p, from };
+    }
+    Spectrum unoccluded() const { return value; }
+    Spectrum through(const Spectrum &transmittance) const {
+        return value * transmittance;
+    }
+};
+
+/// With polarization what is on the way acts on the emission E first: f T E
+template <typename Float, typename Spectrum> struct RaySample<Float, Spectrum, true> {
+    using Point3f = mitsuba::Point<Float, 3>;
+    /// f / p
+    Spectrum value;
+    Spectrum emission;
+    Point3f p, from;
+    DRJIT_STRUCT(RaySample, value, emission, p, from)
+
+    static RaySample make(const Spectrum &f, const Spectrum &emission, const Point3f &p,
+                          const Point3f &from) {
+        return { f, emission, p, from };
+    }
+    Spectrum unoccluded() const { return value * emission; }
+    Spectrum through(const Spectrum &transmittance) const {
+        return value * transmittance * emission;
+    }
+};
+
 template <typename Float, typename Spectrum> class DirectLight {
 public:
     MI_IMPORT_TYPES(Scene, Sampler, Emitter, EmitterPtr, BSDF, BSDFPtr, ShapePtr)
@@ -85,14 +123,9 @@ public:
     Vertex prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
                    const typename Vertex::InMedium *inside, const LightSample<Float> &u,
                    const MaskD &first, Mask active) const {
-        Vertex vertex{ si,
-                       bsdf,
-                       inside,
-                       u,
-                       effort(first),
-                       m_all && m_keep_all ? Lobes::None : m_lights.lobes(),
-                       Extent::Point,
-                       active };
+        Vertex vertex{
+            si, bsdf, inside, u, effort(first), traits(Extent::Point), active
+        };
         look_at_tree(vertex, active);
         return vertex;
     }
@@ -102,10 +135,24 @@ public:
                            const typename Vertex::InMedium &inside,
                            const LightSample<Float> &u, const MaskD &first,
                            Mask active) const {
-        Vertex vertex{ behind,        no_bsdf,     &inside,         u,
-                       effort(first), Lobes::None, Extent::Segment, active };
+        Vertex vertex{ behind, no_bsdf,       &inside,
+                       u,      effort(first), traits(Extent::Segment),
+                       active };
         look_at_tree(vertex, active);
         return vertex;
+    }
+
+    /// What of receivers is in use
+    ReceiverTraits traits(Extent extent) const {
+        const MediaKinds &media = m_media.kinds();
+        bool surface            = extent != Extent::Segment;
+        bool lobes              = surface && !(m_all && m_keep_all);
+        ReceiverTraits result;
+        result.lobes    = lobes ? m_lights.lobes() : Lobes::None;
+        result.media    = media.any;
+        result.extent   = extent;
+        result.channels = media.chromatic ? dr::size_v<UnpolarizedSpectrum> : 0;
+        return result;
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
@@ -199,14 +246,7 @@ public:
     }
 
 private:
-    /// A light sample without visibility: F / p, and where the shadow ray leads
-    struct Sample {
-        Spectrum value;
-        Point3f p;
-        /// Where the ray starts, if that is a choice of the sample (segments)
-        Point3f from;
-        DRJIT_STRUCT(Sample, value, p, from)
-    };
+    using Sample          = RaySample<Float, Spectrum, mitsuba::is_polarized_v<Spectrum>>;
     using InfiniteSamples = std::array<Sample, kMaxInfinite>;
     using KeptSamples =
         std::conditional_t<dr::is_jit_v<Float>, std::monostate, FixedArray<Sample>>;
@@ -409,7 +449,7 @@ private:
         return Rng(1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(stream));
     }
 
-    /// Numbers for shadow rays through heterogeneous media
+    /// Numbers for shadow rays through heterogeneous media, each ray with those after the last
     Rng media_rng(const Vertex &vertex) const {
         return m_media.kinds().heterogeneous ? make_rng(plain_sample(vertex.u), 2)
                                              : Rng();
@@ -423,7 +463,7 @@ private:
         FloatD tau(0.f);
         if (m_choose) {
             for (size_t i = 0; i < infinite_items(); ++i)
-                kept.target[m_slots + i] = Reader::target(infinite[i].value);
+                kept.target[m_slots + i] = Reader::target(infinite[i].unoccluded());
             tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays,
                                               FloatD(vertex.effort.shadow_rays));
         }
@@ -469,25 +509,25 @@ private:
     Spectrum trace_candidates(const Vertex &vertex, Counts<Float> &counts,
                               Mask active) const {
         Spectrum result(0.f);
+        Rng rng = m_all ? media_rng(vertex) : make_rng(plain_sample(vertex.u));
         if (m_all && m_slots > 0)
             result = trace_candidates(
-                vertex, AllLights<FloatD>(dr::opaque<UInt32D>(light_count())),
-                media_rng(vertex), counts, active);
+                vertex, AllLights<FloatD>(dr::opaque<UInt32D>(light_count())), rng,
+                counts, active);
         else if (!m_all)
             result = trace_candidates(vertex,
                                       splitting_cursor(vertex.at, plain(vertex.u.tree)),
-                                      make_rng(plain_sample(vertex.u)), counts, active);
+                                      rng, counts, active);
         if (infinite_items() == 0)
             return result;
         InfiniteSamples infinite = sample_infinite(vertex, active);
-        Rng rng                  = media_rng(vertex);
         for (size_t i = 0; i < infinite_items(); ++i)
             result += trace_sample(vertex, infinite[i], rng, active);
         return result;
     }
 
     template <typename Cursor>
-    Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor, Rng &&rng,
+    Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor, Rng &rng,
                               Counts<Float> &counts, Mask active) const {
         struct State {
             Cursor cursor;
@@ -514,6 +554,7 @@ private:
             },
             "Direct light: rays to all candidates");
         counts.add(state.slot, state.cursor.visits, active);
+        rng = std::move(state.rng);
         return state.result;
     }
 
@@ -539,7 +580,7 @@ private:
             // Far from the smallest floats, which some threads round to zero
             constexpr float least = 1e-30f;
             MaskD traced          = plain(active) && chosen.item < m_slots &&
-                                    Reader::target(sample.value) > least;
+                                    Reader::target(sample.unoccluded()) > least;
             UInt32D slot          = dr::minimum(chosen.item, m_slots - 1u);
             count_ray(m_lights.tree(), vertex.at.cell,
                       read_slot<UInt32D>(kept.light, slot, m_slots),
@@ -576,8 +617,8 @@ private:
 
     Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,
                           Mask active) const {
-        active &=
-            Mask(Reader::target(sample.value) > 0.f); // drops invalid values as well
+        // Drops invalid values as well
+        active &= Mask(Reader::target(sample.unoccluded()) > 0.f);
         if (dr::none_or<false>(active))
             return Spectrum(0.f);
         return visible(vertex, sample, rng, active);
@@ -588,15 +629,17 @@ private:
                      Mask active) const {
         if (!vertex.inside) {
             Mask occluded = m_scene->ray_test(vertex.si.spawn_ray_to(sample.p), active);
-            return sample.value & (active && !occluded);
+            return sample.unoccluded() & (active && !occluded);
         }
         Interaction3f origin = vertex.origin();
         if (vertex.at.extent == Extent::Segment)
             origin.p = sample.from;
-        Ray3f ray   = origin.spawn_ray_to(sample.p);
-        auto medium = m_media.medium_beyond(vertex.si, vertex.inside->medium, ray.d,
-                                            vertex.on_surface(active));
-        return sample.value * m_media.transmittance(ray, medium, rng, active) & active;
+        auto medium =
+            m_media.medium_beyond(vertex.si, vertex.inside->medium, sample.p - origin.p,
+                                  vertex.on_surface(active));
+        return sample.through(
+                   m_media.transmittance(origin, sample.p, medium, rng, active)) &
+               active;
     }
 
     /// |F| of a light's point
@@ -608,7 +651,7 @@ private:
         if constexpr (!dr::is_jit_v<Float>)
             if (m_keeps_samples)
                 kept.sample[slot] = sample;
-        FloatD target = Reader::target(sample.value);
+        FloatD target = Reader::target(sample.unoccluded());
         if (vertex.at.media) {
             bool segment = vertex.at.extent == Extent::Segment;
             auto from    = segment ? plain(sample.from) : vertex.at.p;
@@ -648,7 +691,7 @@ private:
 
         UnpolarizedSpectrum sigma = here.mei.combined_extinction,
                             tr    = dr::exp(-Float(t) * sigma);
-        Float density             = dr::detach(Media::channel_mean(tr * sigma));
+        Float density             = dr::detach(dr::mean(tr * sigma));
         moved.flight_ratio        = dr::select(segment, density / Float(pdf), 1.f);
         if (!target_only && dr::any_or<true>(segment))
             sigma =
@@ -661,7 +704,24 @@ private:
 
     /// Each slot gets its own shift of the number that the distance is chosen with
     static FloatD slot_distance(const Vertex &vertex, const UInt32D &slot) {
-        FloatD shifted = dr::fmadd(FloatD(slot), .6180340f, plain(vertex.u.distance));
+        return shift(plain(vertex.u.distance), slot * 0x9e3779b9u);
+    }
+
+    /// The random channel that the distance of a slot follows
+    static UInt32D slot_channel(const Vertex &vertex, const UInt32D &slot) {
+        if (vertex.at.channels == 0)
+            return 0u;
+        LightSample<FloatD> u = plain_sample(vertex.u);
+        u.selection           = plain(vertex.u.distance);
+        auto bits             = seed_bits(u);
+        UInt32D hash = mitsuba::sample_tea_32(bits.first + slot, bits.second).first;
+        return dr::mul_hi(hash, vertex.at.channels);
+    }
+
+    /// x + number / 2^32, modulo 1: exact however many slots there are
+    template <typename F>
+    static F shift(const F &x, const dr::uint32_array_t<F> &number) {
+        F shifted = x + F(number >> 8u) * 0x1p-24f;
         return shifted - dr::floor(shifted);
     }
 
@@ -677,7 +737,7 @@ private:
         if (vertex.at.extent == Extent::Point)
             return sample_row_point(vertex, row, inclusion, slot, target_only, active);
         Distances along = distances(vertex.at, row);
-        FloatD t        = along.sample(slot_distance(vertex, slot));
+        FloatD t = along.sample(slot_distance(vertex, slot), slot_channel(vertex, slot));
         return at_distance(
             vertex, t, along.pdf(t), target_only, active, [&](const Vertex &v) {
                 return sample_row_point(v, row, inclusion, slot, target_only, active);
@@ -702,8 +762,10 @@ private:
                 constexpr float typical_bsdf = .2f;
                 Float guess = Float(light_importance(vertex.at, row, kinds)) *
                               (vertex.at.lobes == Lobes::None ? typical_bsdf : 1.f);
-                dr::masked(result.value, other) =
-                    mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess));
+                dr::masked(result, other) = Sample::make(
+                    Spectrum(1.f),
+                    mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess)),
+                    Point3f(0.f), Point3f(0.f));
             } else if (dr::any_or<true>(other)) {
                 Sample sample = sample_emitter(vertex, m_emission.emitter_of(row), u,
                                                Float(inclusion), other);
@@ -716,9 +778,8 @@ private:
     /// Each slot gets its own shift of the sampler's point (R2 sequence): stratified over
     /// the samples of a pixel and over the slots
     static Point2f slot_point(const Point2f &u, const UInt32D &slot) {
-        Point2f shifted(dr::fmadd(Float(slot), .7548776662f, u.x()),
-                        dr::fmadd(Float(slot), .5698402910f, u.y()));
-        return shifted - dr::floor(shifted);
+        dr::uint32_array_t<Float> number(slot);
+        return { shift(u.x(), number * 0xc13fa9a9u), shift(u.y(), number * 0x91e10da6u) };
     }
 
     /// A sample of a light of the table
@@ -750,7 +811,8 @@ private:
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
         Mask delta      = row.kind() <= (uint32_t) LightKind::Spot;
         Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
-        return { f * emission * Float(point.weight) & active, Point3f(point.p), from.p };
+        return Sample::make(f & active, emission * Float(point.weight) & active,
+                            Point3f(point.p), from.p);
     }
 
     /// What the vertex scatters times the MIS weight of the light side
@@ -771,7 +833,7 @@ private:
         auto [ds, weight] = emitter->sample_direction(vertex.origin(), u, active);
         active &= ds.pdf != 0.f;
         Spectrum f = scatter(vertex, ds.d, inclusion * ds.pdf, ds.delta, active);
-        return { f * weight & active, ds.p, ds.p };
+        return Sample::make(f & active, weight & active, ds.p, ds.p);
     }
 
     /// Lights at infinity in stage 3: all of them, or one chosen at random if there are many
@@ -801,8 +863,9 @@ private:
                 samples[i] = sample(vertex);
                 continue;
             }
+            UInt32D slot(m_slots + i);
             FloatD t = Distances::sample_transmittance(
-                vertex.at, slot_distance(vertex, UInt32D(m_slots + i)));
+                vertex.at, slot_distance(vertex, slot), slot_channel(vertex, slot));
             samples[i] =
                 at_distance(vertex, t, Distances::transmittance_pdf(vertex.at, t),
                             /* target_only = */ false, active, sample);

@@ -22,11 +22,23 @@ namespace manylights {
 /// What a receiver is: known when kernels are recorded, except where paths look back
 enum class Extent { Point, Segment, Either };
 
+/// Wavelengths of a sample in spectral variants, colour channels in others
+constexpr uint32_t kMostChannels = 4;
+
 /// The lobes that BSDFs of a scene have
 enum class Lobes { None, Reflected, Transmitted /* as well */ };
 
+/// What of a receiver is in use, the same for all of a rendering. What is not costs nothing.
+struct ReceiverTraits {
+    Lobes lobes   = Lobes::None;
+    bool media    = false;
+    Extent extent = Extent::Point;
+    /// Entries of \ref Receiver::extinctions, 0 if the extinction does not vary
+    uint32_t channels = 0;
+};
+
 /// What a shading point shows to the tree
-template <typename Float> struct Receiver {
+template <typename Float> struct Receiver : ReceiverTraits {
     using Vector3f = mitsuba::Vector<Float, 3>;
     using Point3f  = mitsuba::Point<Float, 3>;
     using Mask     = dr::mask_t<Float>;
@@ -45,6 +57,8 @@ template <typename Float> struct Receiver {
     /// Is this a point in a medium, without a cosine? Its extinction, where that is constant
     Mask in_medium;
     Float extinction;
+    /// The same of each wavelength or channel; `extinction` is then the smallest
+    dr::Array<Float, kMostChannels> extinctions;
     /// A segment from p along -wi of this length (0: a point), and where a path went on
     Float length, distance;
     /// Where visibility is learnt (visibility.h)
@@ -53,14 +67,11 @@ template <typename Float> struct Receiver {
     Float top_importance, top_total;
 
     DRJIT_STRUCT(Receiver, p, n, wi, transmits, diffuse, specular, alpha2, through,
-                 transmitted, beta2, in_medium, extinction, length, distance, cell,
-                 top_importance, top_total)
+                 transmitted, beta2, in_medium, extinction, extinctions, length, distance,
+                 cell, top_importance, top_total)
 
-    /// Which of the above are in use, the same for all receivers of a rendering: the lobes
-    /// and the medium. What is not costs nothing.
-    Lobes lobes   = Lobes::None;
-    bool media    = false;
-    Extent extent = Extent::Point;
+    const ReceiverTraits &traits() const { return *this; }
+    ReceiverTraits &traits() { return *this; }
 
     /// The part of a segment that may receive much light: some mean free paths
     Float nearby() const { return dr::minimum(length, 6.f / extinction); }

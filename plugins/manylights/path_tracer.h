@@ -23,6 +23,9 @@ struct PathLimits {
     bool hide_emitters;
 };
 
+/// `max_depth` of paths that only roulette ends
+constexpr uint32_t kUnlimited = (uint32_t) -1;
+
 template <typename Float, typename Spectrum> class PathTracer {
 public:
     MI_IMPORT_TYPES(Scene, Sampler, Medium, MediumPtr, BSDF, BSDFPtr)
@@ -30,12 +33,14 @@ public:
     using Lights      = SceneLights<Float, Spectrum>;
     using Vertex      = manylights::Vertex<Float, Spectrum>;
     using InMedium    = manylights::InMedium<Float, Spectrum>;
+    using Media       = manylights::Media<Float, Spectrum>;
     using FloatD      = dr::detached_t<Float>;
 
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
                const SamplingParameters &params, const PathLimits &limits)
         : m_scene(scene), m_direct(scene, lights, params, media), m_limits(limits),
-          m_media(media.any), m_segments(media.homogeneous),
+          m_media(media.any), m_homogeneous(media.homogeneous),
+          m_segments(media.homogeneous && media.scattering),
           m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr) {}
 
     /// Radiance along a ray from the camera, and whether it met anything
@@ -45,6 +50,9 @@ public:
         if (m_limits.max_depth == 0)
             return { Spectrum(0.f), Mask(false) };
         State state{ sampler, ray, medium, active };
+        if (m_sees_lights)
+            state.from.traits() =
+                m_direct.traits(m_segments ? Extent::Either : Extent::Point);
         state.valid = !m_limits.hide_emitters && m_scene->environment() != nullptr;
         intersect(state, /* coherent = */ true);
         loop(
@@ -98,13 +106,16 @@ private:
             s.pi.compute_surface_interaction(s.ray, +mitsuba::RayFlags::All, surface);
         if (m_segments)
             add_segment_light(s, si, piece);
+        if (m_media && m_limits.hide_emitters)
+            piece.hidden = is_hidden(s, si, surface);
         if (m_sees_lights)
-            add_emission(s, si, piece, surface);
+            add_emission(s, si, piece, surface && !piece.hidden);
         surface &= si.is_valid();
         Mask ends_there = surface && !piece.scattered;
 
         BSDFPtr bsdf = bsdf_of(si, surface);
-        Mask goes_on = ends_there && (!is_last(s) || can_pass(bsdf, ends_there));
+        Mask goes_on =
+            ends_there && (!is_last(s) || can_pass(bsdf, ends_there) || piece.hidden);
         s.valid |= ends_there && !goes_on;
         s.active &= piece.scattered || goes_on;
         if (dr::none_or<false>(s.active))
@@ -114,10 +125,12 @@ private:
         Vertex vertex = m_direct.prepare(
             si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
             plain(s.depth == 0u), m_media ? surface || piece.inside.here : surface);
-        add_direct_light(s, vertex, piece, surface);
+        add_direct_light(s, vertex, piece, surface && !piece.hidden);
         scatter(s, vertex, piece);
         play_roulette(s);
         intersect(s, /* coherent = */ false);
+        if (m_media)
+            start_at(s, vertex);
     }
 
     // --------------------------------------------------------------------- Medium event
@@ -133,6 +146,8 @@ private:
         UnpolarizedSpectrum seen = 1.f;
         /// Factor of the path that goes on
         UnpolarizedSpectrum weight = 1.f;
+        /// Does it end on an emitter that the camera does not see, but what is behind it?
+        Mask hidden = false;
         /// The segment as the tree sees it, and its random number
         Receiver<FloatD> along;
         Float u_tree;
@@ -151,7 +166,10 @@ private:
             inside.mei      = flight.mei;
             piece.scattered = within && flight.scattered && !is_last(s);
             piece.weight    = dr::select(within, flight.weight, 1.f);
-            s.active &= !(flight.scattered && within) || piece.scattered;
+            Mask exact      = within && passes_exactly(s, within);
+            s.active &= !(flight.scattered && within) || piece.scattered || exact;
+            if (m_homogeneous)
+                take_exact(s, piece, exact);
             s.valid |= piece.scattered;
             piece.seen = piece.weight;
             if (m_segments)
@@ -162,13 +180,26 @@ private:
         inside.mei.wavelengths = s.ray.wavelengths;
     }
 
+    /// Where nothing that is scattered counts, what goes on has the known transmittance, and
+    /// not that of a flight which may end
+    Mask passes_exactly(const State &s, Mask within) const {
+        if (!m_homogeneous || (m_segments && m_limits.max_depth == kUnlimited))
+            return false;
+        Mask exact = within && s.medium->is_homogeneous();
+        return m_segments ? Mask(exact && is_last(s)) : exact;
+    }
+
+    void take_exact(const State &s, Piece &piece, Mask exact) const {
+        piece.scattered &= !exact;
+        dr::masked(piece.weight, exact) = Media::transmittance(piece.inside.mei, s.pi.t);
+    }
+
     /// Is this a piece whose single scattering is estimated as a whole?
     void find_segment(const State &s, Piece &piece, Mask within) const {
-        piece.segment             = within && s.medium->is_homogeneous() &&
-                                    s.medium->use_emitter_sampling() && !is_last(s);
-        UnpolarizedSpectrum sigma = piece.inside.mei.combined_extinction;
+        piece.segment = within && s.medium->is_homogeneous() &&
+                        s.medium->use_emitter_sampling() && !is_last(s) && s.pi.t > 0.f;
         dr::masked(piece.seen, piece.segment) =
-            dr::exp(-dr::minimum(s.pi.t, dr::Largest<Float>) * sigma);
+            Media::transmittance(piece.inside.mei, s.pi.t);
     }
 
     // ------------------------------------------------------------------- Light of a vertex
@@ -263,6 +294,13 @@ private:
         s.ray = next.ray;
     }
 
+    /// Rays start a little off their surface, pieces in media do not
+    void start_at(State &s, const Vertex &vertex) const {
+        Float lead = dr::detach(dr::dot(s.ray.o - vertex.origin().p, s.ray.d));
+        s.ray.o -= lead * s.ray.d;
+        s.pi.t += lead;
+    }
+
     /// A direction from the BSDF or the phase function, whichever a lane has come to
     MI_NOINLINE Direction sample_either(const State &s, const Vertex &vertex,
                                         const Piece &piece, const Float &u1,
@@ -271,6 +309,12 @@ private:
         Mask surface   = s.active && !piece.scattered;
         if (dr::any_or<true>(surface))
             next = sample_bsdf(vertex, u1, u2, surface);
+        if (m_limits.hide_emitters) {
+            next.null |= piece.hidden;
+            dr::masked(next.ray, piece.hidden)    = vertex.si.spawn_ray(s.ray.d);
+            dr::masked(next.weight, piece.hidden) = Spectrum(1.f);
+            dr::masked(next.eta, piece.hidden)    = 1.f;
+        }
         Mask scattered = s.active && piece.scattered;
         if (dr::any_or<true>(scattered))
             next = merge(next, sample_phase(s, piece, u1, u2, scattered), scattered);
@@ -292,9 +336,6 @@ private:
             dr::masked(s.from, plain(along)) = piece.along;
             dr::masked(s.u_tree, along)      = piece.u_tree;
         }
-        s.from.lobes  = vertex.at.lobes;
-        s.from.media  = vertex.at.media;
-        s.from.extent = m_segments ? Extent::Either : Extent::Point;
     }
 
     Direction sample_bsdf(const Vertex &vertex, const Float &u1, const Point2f &u2,
@@ -334,9 +375,8 @@ private:
         }
         if (m_segments) { // a density of distance and direction, as that of light sampling
             const UnpolarizedSpectrum &sigma = mei.combined_extinction;
-            Float density =
-                Media<Float, Spectrum>::channel_mean(sigma * dr::exp(-mei.t * sigma));
-            dr::masked(pdf, piece.segment) = pdf * density;
+            Float density                    = dr::mean(sigma * dr::exp(-mei.t * sigma));
+            dr::masked(pdf, piece.segment)   = pdf * density;
         }
         return { ray,        weight & (active && pdf > 0.f),      pdf,
                  Float(1.f), !mei.medium->use_emitter_sampling(), Mask(false) };
@@ -363,6 +403,14 @@ private:
         return surface && has_flag(bsdf->flags(), mitsuba::BSDFFlags::Null);
     }
 
+    /// Emitters that the camera does not see may still be borders of media
+    Mask is_hidden(const State &s, const SurfaceInteraction3f &si, Mask surface) const {
+        surface &= s.depth == 0u && si.is_valid();
+        if (dr::any_or<true>(surface))
+            surface &= si.shape->emitter() != nullptr;
+        return surface;
+    }
+
     void play_roulette(State &s) const {
         Float most = dr::max(mitsuba::unpolarized_spectrum(s.throughput));
         s.active &= most != 0.f;
@@ -374,8 +422,8 @@ private:
 
     void intersect(State &s, bool coherent) const {
         s.pi = m_scene->ray_intersect_preliminary(s.ray, coherent, s.active);
-        if (m_limits.hide_emitters && (coherent || m_media))
-            skip_emitters(m_scene, s.ray, s.pi, s.active && s.depth == 0u);
+        if (m_limits.hide_emitters && coherent && !m_media)
+            skip_emitters(m_scene, s.ray, s.pi, s.active);
     }
 
     BSDFPtr bsdf_of(const SurfaceInteraction3f &si, Mask active) const {
@@ -387,7 +435,9 @@ private:
     const Scene *m_scene;
     DirectLight m_direct;
     PathLimits m_limits;
-    bool m_media, m_segments, m_sees_lights;
+    /// Are there media, homogeneous ones, and those whose single scattering is estimated along
+    /// whole segments? Can a path find light by chance?
+    bool m_media, m_homogeneous, m_segments, m_sees_lights;
 };
 
 } // namespace manylights

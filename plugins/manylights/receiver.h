@@ -33,7 +33,7 @@ public:
 
     /// Lobes are measured only if the scene has any: each costs two evaluations of the BSDF
     static void read(Receiver<FloatD> &at, const SurfaceInteraction3f &si,
-                     const BSDFPtr &bsdf, Lobes lobes, Mask active) {
+                     const BSDFPtr &bsdf, Mask active) {
         auto flags     = bsdf->flags(active);
         Mask transmits = has_flag(flags, mitsuba::BSDFFlags::Transmission);
         Vector3f n     = dr::mulsign(Vector3f(si.sh_frame.n), Frame3f::cos_theta(si.wi));
@@ -41,9 +41,9 @@ public:
         at.n           = plain(n);
         at.wi          = plain(si.to_world(si.wi));
         at.transmits   = plain(transmits);
-        if (lobes != Lobes::None)
+        if (at.lobes != Lobes::None)
             measure_lobe(si, bsdf, at, active);
-        if (lobes == Lobes::Transmitted)
+        if (at.lobes == Lobes::Transmitted)
             measure_transmission(
                 si, bsdf, at,
                 active && has_flag(flags, mitsuba::BSDFFlags::GlossyTransmission));
@@ -56,17 +56,14 @@ public:
         active &= inside.medium != nullptr;
         if (dr::any_or<true>(active))
             active &= inside.medium->is_homogeneous();
-        // The channel of the smallest extinction sees farthest
-        const UnpolarizedSpectrum &sigma = inside.mei.combined_extinction;
-        FloatD extinction = plain(dr::maximum(dr::min(sigma), .05f * dr::mean(sigma)));
-        MaskD here        = plain(inside.here);
-        at.extinction     = dr::select(plain(active), extinction, 0.f);
-        at.in_medium      = here;
-        at.length         = plain(inside.length);
-        at.p              = dr::select(at.length > 0.f, plain(inside.start),
-                                       dr::select(here, plain(inside.mei.p), at.p));
-        at.wi             = dr::select(here, plain(inside.mei.wi), at.wi);
-        dr::masked(at.n, here)           = 0.f;
+        MaskD here = plain(inside.here);
+        read_extinction(at, inside.mei.combined_extinction, plain(active));
+        at.in_medium           = here;
+        at.length              = plain(inside.length);
+        at.p                   = dr::select(at.length > 0.f, plain(inside.start),
+                                            dr::select(here, plain(inside.mei.p), at.p));
+        at.wi                  = dr::select(here, plain(inside.mei.wi), at.wi);
+        dr::masked(at.n, here) = 0.f;
         dr::masked(at.diffuse, here)     = 1.f;
         dr::masked(at.specular, here)    = 0.f;
         dr::masked(at.transmitted, here) = 0.f;
@@ -74,6 +71,20 @@ public:
     }
 
 private:
+    /// The smallest extinction sees farthest; where it is 0, nothing is scattered
+    static void read_extinction(Receiver<FloatD> &at, const UnpolarizedSpectrum &sigma,
+                                const MaskD &active) {
+        if (at.channels == 0) {
+            at.extinction = dr::select(active, plain(sigma.entry(0)), 0.f);
+            return;
+        }
+        FloatD least = dr::min(
+            plain(dr::select(sigma > 0.f, sigma, dr::Infinity<UnpolarizedSpectrum>)));
+        at.extinction = dr::select(active && dr::isfinite(least), least, 0.f);
+        for (uint32_t i = 0; i < at.channels; ++i)
+            at.extinctions.entry(i) = dr::maximum(plain(sigma.entry(i)), at.extinction);
+    }
+
     /**
      * The glossy lobe, for any BSDF: its value and density in the mirror direction, and its
      * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.

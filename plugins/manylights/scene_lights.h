@@ -183,8 +183,7 @@ public:
         // The same emitters may belong to another scene: a new one that lies in memory
         // where a deleted one lay
         MediaKinds media = Media<Float, Spectrum>::find(scene);
-        result.mix_common(4 * (uint32_t) find_lobes(scene) + 2 * media.homogeneous +
-                          media.heterogeneous);
+        result.mix_common((uint32_t) find_lobes(scene) + 4 * media.bits());
         return result;
     }
 

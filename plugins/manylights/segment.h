@@ -9,7 +9,8 @@
  * variance is unbounded. So lights are chosen for the whole segment, and a distance for each
  * of them, half of the time with equal angles as seen from the light (Kulla and Fajardo,
  * "Importance Sampling Techniques for Path Tracing in Participating Media", 2012), half
- * of the time in proportion to the transmittance.
+ * of the time in proportion to the transmittance: that of a random channel or wavelength
+ * where these differ.
  */
 
 #include "receiver.h"
@@ -20,6 +21,7 @@ namespace manylights {
 template <typename Float> class SegmentDistances {
 public:
     using Receiver = manylights::Receiver<Float>;
+    using UInt32   = dr::uint32_array_t<Float>;
     using Vector3f = mitsuba::Vector<Float, 3>;
 
     /// @param w  from the start of the segment to the light's centre
@@ -28,10 +30,11 @@ public:
           m_view(-dr::dot(at.wi, w), dr::squared_norm(w), variance, at.nearby()),
           m_angle(m_view.angle()) {}
 
-    Float sample(const Float &u) const {
+    /// @param channel  random, below \ref Receiver::channels
+    Float sample(const Float &u, const UInt32 &channel) const {
         Float v = 2.f * u;
         return dr::select(v < 1.f, sample_equiangular(v),
-                          sample_transmittance(m_at, v - 1.f));
+                          sample_transmittance(m_at, v - 1.f, channel));
     }
 
     Float pdf(const Float &t) const {
@@ -41,20 +44,34 @@ public:
         return .5f * (equiangular + transmittance_pdf(m_at, t));
     }
 
-    /// Density proportional to the transmittance, or constant if that hardly changes
-    static Float sample_transmittance(const Receiver &at, const Float &u) {
-        Float depth = at.extinction * at.length;
-        Float t     = -dr::log(1.f - u * (1.f - dr::exp(-depth))) / at.extinction;
+    /// Density proportional to a channel's transmittance, or constant if that hardly changes
+    static Float sample_transmittance(const Receiver &at, const Float &u,
+                                      const UInt32 &channel) {
+        Float extinction = at.extinction;
+        for (uint32_t i = 0; i < at.channels; ++i)
+            extinction = dr::select(channel == i, at.extinctions.entry(i), extinction);
+        Float depth = extinction * at.length;
+        Float t     = -dr::log(1.f - u * (1.f - dr::exp(-depth))) / extinction;
         return dr::minimum(dr::select(depth < kThin, u * at.length, t), at.length);
     }
     static Float transmittance_pdf(const Receiver &at, const Float &t) {
-        Float depth = at.extinction * at.length;
-        Float pdf = at.extinction * dr::exp(-at.extinction * t) / (1.f - dr::exp(-depth));
-        return dr::select(depth < kThin, dr::rcp(at.length), pdf);
+        if (at.channels == 0)
+            return exponential_pdf(at.extinction, at.length, t);
+        Float sum(0.f);
+        for (uint32_t i = 0; i < at.channels; ++i)
+            sum += exponential_pdf(at.extinctions.entry(i), at.length, t);
+        return sum * (1.f / at.channels);
     }
 
 private:
     static constexpr float kThin = .02f;
+
+    static Float exponential_pdf(const Float &extinction, const Float &length,
+                                 const Float &t) {
+        Float depth = extinction * length;
+        Float pdf   = extinction * dr::exp(-extinction * t) / (1.f - dr::exp(-depth));
+        return dr::select(depth < kThin, dr::rcp(length), pdf);
+    }
 
     /// n^2 sin / (D cos + nearest sin) with the angle from the segment's start, at a distance
     /// n from the light: no difference of large numbers

@@ -91,18 +91,16 @@ template <typename Float, typename Spectrum> struct Vertex {
     Float flight_ratio = Float(1.f);
 
     Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
-           const LightSample<Float> &u, const Effort<FloatD> &effort, Lobes lobes,
-           Extent extent, Mask active)
+           const LightSample<Float> &u, const Effort<FloatD> &effort,
+           const ReceiverTraits &traits, Mask active)
         : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort),
           at(dr::zeros<Receiver<FloatD>>()) {
+        at.traits()  = traits;
         Mask surface = on_surface(active);
-        if (extent == Extent::Point && dr::any_or<true>(surface))
-            Reader::read(at, si, bsdf, lobes, surface);
+        if (at.extent == Extent::Point && dr::any_or<true>(surface))
+            Reader::read(at, si, bsdf, surface);
         if (inside)
             Reader::add_medium(at, *inside, active);
-        at.lobes  = lobes;
-        at.media  = inside != nullptr;
-        at.extent = extent;
     }
 
     Mask on_surface(Mask active) const {
