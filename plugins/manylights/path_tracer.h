@@ -130,7 +130,7 @@ private:
         play_roulette(s);
         intersect(s, /* coherent = */ false);
         if (m_media)
-            start_at(s, vertex);
+            start_at(s, si.p, !piece.scattered);
     }
 
     // --------------------------------------------------------------------- Medium event
@@ -295,8 +295,9 @@ private:
     }
 
     /// Rays start a little off their surface, pieces in media do not
-    void start_at(State &s, const Vertex &vertex) const {
-        Float lead = dr::detach(dr::dot(s.ray.o - vertex.origin().p, s.ray.d));
+    void start_at(State &s, const Point3f &p, Mask surface) const {
+        Float lead = dr::detach(dr::dot(s.ray.o - p, s.ray.d));
+        lead       = dr::select(s.active && surface, lead, 0.f);
         s.ray.o -= lead * s.ray.d;
         s.pi.t += lead;
     }
@@ -327,6 +328,8 @@ private:
         dr::masked(s.depth, leaves) = s.depth + 1u;
         if (!m_sees_lights)
             return;
+        // Scalar variants assign what is in use, too
+        ReceiverTraits traits             = s.from.traits();
         dr::masked(s.from, plain(leaves)) = vertex.at;
         dr::masked(s.u_tree, leaves)      = vertex.u.tree;
         dr::masked(s.pdf, leaves)         = dr::detach(next.pdf);
@@ -336,6 +339,7 @@ private:
             dr::masked(s.from, plain(along)) = piece.along;
             dr::masked(s.u_tree, along)      = piece.u_tree;
         }
+        s.from.traits() = traits;
     }
 
     Direction sample_bsdf(const Vertex &vertex, const Float &u1, const Point2f &u2,
