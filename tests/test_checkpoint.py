@@ -12,8 +12,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import checkpoint, cli, images, loading, rendering
+from manylights import checkpoint, cli, loading, rendering
 from manylights.errors import UsageError
+from manylights.output import images
 from manylights.progress import Estimate
 
 from tests.conftest import heed_ctrl_c, require_variant

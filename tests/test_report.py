@@ -446,7 +446,7 @@ def test_missing_images_are_refused(small, name):
 def test_broken_image_is_refused(small):
     path = small()
     (path / "room" / "talk.exr").write_bytes(b"no image")
-    with pytest.raises(UsageError, match=r"talk\.exr: not readable"):
+    with pytest.raises(UsageError, match=r"talk\.exr: not a readable image"):
         page.render(results.load(path), publish=False)
 
 

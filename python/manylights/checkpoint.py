@@ -1,9 +1,9 @@
 """Keeps the state of a long render in a file, so that the render can go on after it was killed.
 
 The file is an OpenEXR image that any viewer shows: the picture so far in its own channels, the
-film's sums in ``checkpoint_sum.*`` and ``checkpoint_rest.*`` (the two parts of
-``rendering.Sums``), and in the attributes ``manylights.*`` what was rendered, as JSON. It is
-written under another name and then renamed: whoever is killed while writing leaves the one before.
+two parts of the film's sums in channels of their own (``output.channels``), and in the attributes
+``manylights.*`` what was rendered, as JSON. It is written under another name and then renamed:
+whoever is killed while writing leaves the one before.
 """
 
 from __future__ import annotations
@@ -20,13 +20,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights import files, images, rendering
+from manylights import files, rendering
 from manylights.errors import UsageError, one_line
 from manylights.loading import LoadedScene
+from manylights.output import channels, images
+from manylights.output.channels import REST, SUM
 from manylights.progress import say
-from manylights.threads import threads_for_files
 
-SUM, REST, ATTRIBUTE = "checkpoint_sum.", "checkpoint_rest.", "manylights."
+#: Prefix of the file's attributes.
+ATTRIBUTE = "manylights."
 
 REMEDY = "delete it to start anew, or choose another output"
 
@@ -149,16 +151,12 @@ class Checkpoint:
 
     def _write(self, film) -> None:
         picture = rendering.develop(film, self.sums)
-        names = [field.name for field in film.bitmap(raw=True).struct_()]
-        channels = [field.name for field in picture.struct_()]
-        channels += [prefix + name for prefix in (SUM, REST) for name in names]
-        formats, kind = mi.Bitmap.PixelFormat, mi.Struct.Type.Float32
-        bitmap = mi.Bitmap(formats.MultiChannel, kind, picture.size(), len(channels), channels)
+        summed = channels.names(film.bitmap(raw=True))
         colors = np.array(picture).reshape(*self.sums.high.shape[:2], -1)
-        parts = (colors, self.sums.high, self.sums.low)
-        np.concatenate(parts, axis=2, out=np.array(bitmap, copy=False))
+        names = channels.names(picture) + [part + name for part in (SUM, REST) for name in summed]
+        bitmap = channels.join(names, colors, self.sums.high, self.sums.low)
         done = {"passes": self.sums.passes, "samples_done": self._samples_done()}
-        for name, value in {**self.job, **done, "channels": names}.items():
+        for name, value in {**self.job, **done, "channels": summed}.items():
             bitmap.metadata()[ATTRIBUTE + name] = json.dumps(value)
         with self.writing:
             images.write_whole(bitmap, self.path, mi.Bitmap.FileFormat.OpenEXR)
@@ -166,14 +164,13 @@ class Checkpoint:
 
     def _read(self) -> rendering.Sums:
         try:
-            with threads_for_files():
-                bitmap = mi.Bitmap(str(self.path))
+            bitmap = channels.read(self.path)
             facts = {
                 name[len(ATTRIBUTE) :]: json.loads(value)
                 for name, value in bitmap.metadata().items()
                 if name.startswith(ATTRIBUTE)
             }
-        except (RuntimeError, ValueError) as error:
+        except (UsageError, ValueError) as error:
             text = f"{self.path}: not a whole checkpoint, {REMEDY} ({one_line(error)})"
             raise UsageError(text) from error
         if "channels" not in facts:
@@ -182,11 +179,10 @@ class Checkpoint:
         if changes:
             changes = "; ".join(changes)
             raise UsageError(f"{self.path}: of another render, {REMEDY}. It has {changes}")
-        pixels = np.array(bitmap)
-        index = {field.name: number for number, field in enumerate(bitmap.struct_())}
+        found = channels.split(bitmap)
         parts = (
-            pixels[..., [index[prefix + name] for name in facts["channels"]]]
-            for prefix in (SUM, REST)
+            np.stack([found[part + name] for name in facts["channels"]], axis=-1)
+            for part in (SUM, REST)
         )
         return rendering.Sums(facts["passes"], *parts)
 

@@ -229,7 +229,8 @@ def _plugin_dir(options) -> None:
 
 
 def _render(options) -> None:
-    from manylights import images, integrators, loading
+    from manylights import integrators, loading
+    from manylights.output import images
 
     target = images.check_output(options.output)
     defines = integrators.parse_assignments(options.define, "-D")
@@ -259,7 +260,8 @@ def _open_checkpoint(loaded, target, options, choices):
 
 def _render_to(loaded, target, options, spp: int, sensor: int = 0, checkpoint=None) -> float:
     """Render with a progress bar, write the images, and return the seconds of the render."""
-    from manylights import images, rendering
+    from manylights import rendering
+    from manylights.output import images
     from manylights.progress import run_with_bar
 
     def work(report):
@@ -299,7 +301,8 @@ def _tree(options) -> None:
 def _demo(options) -> None:
     import mitsuba as mi
 
-    from manylights import images, integrators, loading, scenes, tree
+    from manylights import integrators, loading, scenes, tree
+    from manylights.output import images
 
     target = images.check_output(f"{options.output}.exr")
     variant = _start(options)

@@ -214,11 +214,12 @@ def _compare(options) -> int:
 
     from manylights import files
     from manylights.bench import compare, metrics
+    from manylights.output import channels
 
     mi.set_variant("scalar_rgb")
     names = [options.first, options.second]
     names += [options.reference] if options.reference else []
-    images = [compare.read_image(name) for name in names]
+    images = [channels.read_colors(name) for name in names]
     for name, image in zip(names, images):
         compare.check_size(image, name, images[0], names[0])
     trim = metrics.TRIM if options.trim is None else options.trim

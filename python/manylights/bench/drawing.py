@@ -53,7 +53,7 @@ def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
 
 
 def draw_channels(
-    loaded: LoadedScene, integrator, spp: int, seed: int, names: list[str]
+    loaded: LoadedScene, integrator, spp: int, seed: int, names: tuple[str, ...]
 ) -> np.ndarray:
     """Render a scene and return those channels that the integrator adds under these names."""
     pixels = np.array(integrator.render(loaded.scene, sensor=0, seed=seed, spp=spp))

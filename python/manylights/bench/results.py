@@ -14,12 +14,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights import files, images
+from manylights import files
 from manylights.bench import metrics
 from manylights.bench.methods import Method
 from manylights.bench.scene_source import Source
 from manylights.errors import UsageError, one_line
-from manylights.threads import threads_for_files
+from manylights.output import channels, images
 
 FORMAT, NAME = 1, "results.json"
 
@@ -48,21 +48,16 @@ class Results:
         with self.writing, files.written_whole(self.folder / NAME) as partial:
             partial.write_text(text)
 
-    def write_image(self, scene: str, name: str, pixels: np.ndarray, channels: list[str]) -> None:
+    def write_image(self, scene: str, name: str, pixels: np.ndarray, names) -> None:
         """Write ``SCENE/NAME.exr``, whole or not at all, in single precision."""
         target = self.folder / scene / f"{name}.exr"
-        size = [pixels.shape[1], pixels.shape[0]]
-        formats, kind = mi.Bitmap.PixelFormat, mi.Struct.Type.Float32
-        # Made of an array, a bitmap calls its channels Y and A or R, G and B.
-        bitmap = mi.Bitmap(formats.MultiChannel, kind, size, len(channels), channels)
-        np.array(bitmap, copy=False)[:] = pixels
+        bitmap = channels.join(names, pixels)
         with self.writing:
             images.write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)
 
     def read_reference(self, scene: str) -> np.ndarray:
         """Return the reference of a scene, shape (height, width, 3)."""
-        with threads_for_files():
-            return np.array(mi.Bitmap(str(self.folder / scene / "reference.exr")))
+        return channels.read_colors(self.folder / scene / "reference.exr")
 
     def has_image(self, scene: str, name: str) -> bool:
         """Is there ``SCENE/NAME.exr``?"""

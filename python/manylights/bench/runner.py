@@ -26,6 +26,7 @@ from manylights.bench.results import Results, is_skipped, series_of, skip, unski
 from manylights.bench.scene_source import LoadedScene, Source
 from manylights.bench.workload import Workload
 from manylights.errors import UsageError, one_line
+from manylights.output import channels
 from manylights.power import power_sampling, power_weights
 from manylights.progress import say
 
@@ -47,8 +48,6 @@ MAP_SAMPLES = 4
 #: Shares of a budget that one method takes at one seed, and renders at the end: before anything is
 #: measured the time left is guessed with them.
 GUESSED_SHARE, GUESSED_ENDING = 0.8, 4.0
-
-RGB = ["R", "G", "B"]
 
 
 @dataclass
@@ -300,7 +299,7 @@ class SceneRun:
         name = self.entry["name"]
         if self.job.reference is not None:
             image, facts = reference.read(self.job.reference, self.loaded.size)
-            self.found.write_image(name, "reference", image, RGB)
+            self.found.write_image(name, "reference", image, channels.RGB)
             self.reference, self.entry["reference"] = image, facts
         elif self.entry["reference"] is not None and self.found.has_image(name, "reference"):
             self.reference = self.found.read_reference(name)
@@ -316,7 +315,7 @@ class SceneRun:
             )
         except BrokenImage as error:
             raise UsageError(f"{name}: the reference failed: {error}") from error
-        self.found.write_image(name, "reference", image, RGB)
+        self.found.write_image(name, "reference", image, channels.RGB)
         self.reference, self.entry["reference"] = image, facts
         self.found.save()
         say(
@@ -375,7 +374,7 @@ class SceneRun:
         if len(moments.seeds) > 1:
             variance = moments.variance() * max(candidate.spps)
             name = f"{candidate.method.key}.variance"
-            self.found.write_image(self.entry["name"], name, variance, RGB)
+            self.found.write_image(self.entry["name"], name, variance, channels.RGB)
 
     # -- at the end
 
@@ -398,7 +397,8 @@ class SceneRun:
             "error_trimmed": metrics.trimmed_mean(errors),
             "flip": metrics.flip_error(drawing.image, self.reference),
         }
-        self.found.write_image(self.entry["name"], candidate.method.key, drawing.image, RGB)
+        key = candidate.method.key
+        self.found.write_image(self.entry["name"], key, drawing.image, channels.RGB)
         self.found.save()
         self.work.finish(self.job.source.text, 3.0 * target)
 
@@ -423,9 +423,8 @@ class SceneRun:
             return
         description = integrator_for(candidate.method, self.loaded.kind)
         counting = mi.load_dict({**description, "counts": True})
-        channels = ["candidates", "node_visits"]
-        maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, channels)
-        self.found.write_image(self.entry["name"], name, maps, channels)
+        maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, channels.WORK)
+        self.found.write_image(self.entry["name"], name, maps, channels.WORK)
 
 
 def _new_series(method: Method, loaded: LoadedScene) -> dict[str, Any]:
