@@ -12,8 +12,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import __version__, cli, integrators, loading, rendering
+from manylights import __version__, cli, loading, rendering
 from manylights.errors import UsageError
+from manylights.loading import integrators
 from manylights.progress import Estimate, format_seconds
 
 from tests.conftest import heed_ctrl_c, require_variant
@@ -99,7 +100,7 @@ def choose(tmp_path):
     def run(text, wanted=None, **settings):
         path = tmp_path / "chosen.xml"
         path.write_text(f'<scene version="3.0.0">{text}</scene>')
-        _, state = loading.parse(str(path), {})
+        state = loading.parse(str(path)).state
         notes = integrators.choose(state, wanted, settings)
         leaves = integrators.leaf_integrators(state)
         if not leaves:
@@ -287,8 +288,9 @@ def test_unknown_parameters_are_refused_with_those_of_the_integrator(choose, plu
 def test_listed_parameters_are_those_of_the_plugin(plugin):
     """The plugin accepts all that the help lists, and the defaults are those it states."""
     mi.set_variant("scalar_rgb")
-    for name, meaning in integrators.PARAMETERS[plugin].items():
-        default = integrators.parse_value(meaning.rpartition("default ")[2].split(",")[0])
+    for name, parameter in integrators.PARAMETERS[plugin].items():
+        default = integrators.parse_value(str(parameter).rpartition("default ")[2].split(",")[0])
+        assert default == parameter.default
         needed = {"method": "talk"} if name == "split_function" else {}
         untouched = mi.load_dict({"type": plugin, **needed})
         assert str(mi.load_dict({"type": plugin, name: default, **needed})) == str(untouched)
@@ -301,7 +303,7 @@ def test_parameters_of_the_tree_are_found(tmp_path, plugin):
     hidden = '<boolean name="hide_emitters" value="true"/>'
     parameters = f'<float name="splitting_rate" value="2"/>{hidden}'
     path.write_text(f'<scene version="3.0.0">{integrator(plugin, parameters)}</scene>')
-    _, state = loading.parse(str(path), {})
+    state = loading.parse(str(path)).state
     assert integrators.ours_in(state) == (plugin, {"splitting_rate": 2.0})
 
 

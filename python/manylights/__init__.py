@@ -26,7 +26,7 @@ register()
 
 # These need the right Mitsuba, which register() checks.
 from manylights import scenes  # noqa: E402
-from manylights.merging import merge_emitters  # noqa: E402
+from manylights.loading.merging import merge_emitters  # noqa: E402
 from manylights.power import power_sampling, power_weights  # noqa: E402
 
 __version__ = "0.1.0"

@@ -135,7 +135,7 @@ def _add_render(commands, common) -> None:
 
 def _parameter_help() -> str:
     """Return the parameters of our integrators as a table for the help."""
-    from manylights.integrators import PARAMETERS
+    from manylights.loading.integrators import PARAMETERS
 
     lines = []
     for plugin, parameters in PARAMETERS.items():
@@ -229,7 +229,8 @@ def _plugin_dir(options) -> None:
 
 
 def _render(options) -> None:
-    from manylights import integrators, loading
+    from manylights import loading
+    from manylights.loading import integrators
     from manylights.output import images
 
     target = images.check_output(options.output)
@@ -290,7 +291,8 @@ def _render_to(loaded, target, options, spp: int, sensor: int = 0, checkpoint=No
 
 
 def _tree(options) -> None:
-    from manylights import integrators, loading, tree
+    from manylights import loading, tree
+    from manylights.loading import integrators
 
     loading.set_variant(options.variant)
     defines = integrators.parse_assignments(options.define, "-D")
@@ -301,7 +303,8 @@ def _tree(options) -> None:
 def _demo(options) -> None:
     import mitsuba as mi
 
-    from manylights import integrators, loading, scenes, tree
+    from manylights import loading, scenes, tree
+    from manylights.loading import integrators
     from manylights.output import images
 
     target = images.check_output(f"{options.output}.exr")

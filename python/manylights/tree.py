@@ -6,7 +6,8 @@ from collections import Counter
 
 import mitsuba as mi
 
-from manylights import integrators, loading
+from manylights import loading
+from manylights.loading import integrators
 from manylights.threads import threads_for_files
 
 #: What the integrator publishes once the tree is built, in the order of the report.
@@ -41,9 +42,9 @@ def describe(path: str, defines: dict[str, str] | None = None) -> dict:
         ``kinds``, a dictionary from the kind of light to its count.
     """
     with loading.search_beside(path), threads_for_files():
-        config, state = loading.parse(path, defines or {})
-        plugin, parameters = integrators.ours_in(state)
-        scene = loading.instantiate(config, state)
+        parsed = loading.parse(path, defines)
+        plugin, parameters = integrators.ours_in(parsed.state)
+        scene = loading.instantiate(parsed)
     integrator = mi.load_dict({"type": plugin, **parameters})
     integrator.render(scene, sensor=_tiny_sensor(), seed=0, spp=1)
     values = mi.traverse(integrator)

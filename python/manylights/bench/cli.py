@@ -170,10 +170,10 @@ def _jobs(options) -> list:
     Raises:
         UsageError: no scene, an unknown one, an unknown method, a reference for several scenes.
     """
-    from manylights import integrators
     from manylights.bench import methods, reference, scene_source, standard
     from manylights.bench.runner import Job
     from manylights.errors import UsageError
+    from manylights.loading import integrators
 
     defines = integrators.parse_assignments(options.define, "-D")
     chosen = _methods(options.methods)

@@ -14,12 +14,12 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights import integrators
 from manylights.errors import UsageError, one_line
+from manylights.loading import integrators
 
 #: Names of methods: Mitsuba's integrators, and values of our parameter ``method``.
 MITSUBAS = ("uniform", "power")
-OURS = ("resampled_tree", "talk", "adaptive_splitting", "tree", "exhaustive")
+OURS = integrators.METHODS
 NAMES = (*MITSUBAS, *OURS)
 
 #: More lights would take hours with ``exhaustive``, which evaluates them all at every point.
@@ -27,8 +27,8 @@ EXHAUSTIVE_LIGHTS = 10_000
 
 #: Parameters that a method may have: what makes up the method, not what is measured about it.
 PARAMETERS = {
-    name: meaning
-    for name, meaning in integrators.SAMPLING_PARAMETERS.items()
+    name: parameter
+    for name, parameter in integrators.SAMPLING_PARAMETERS.items()
     if name not in ("method", "counts")
 }
 
@@ -48,7 +48,8 @@ class Method:
     @property
     def spec(self) -> str:
         """The method as text, always the same for the same method."""
-        return ":".join([self.name, *(f"{k}={_text(v)}" for k, v in self.parameters.items())])
+        items = self.parameters.items()
+        return ":".join([self.name, *(f"{k}={integrators.value_text(v)}" for k, v in items)])
 
     @property
     def key(self) -> str:
@@ -159,13 +160,7 @@ def _value(name: str, text: str) -> Any:
         # As text, which the plugins read, since JSON has no infinity.
         return "inf"
     is_number = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if is_number and PARAMETERS[name].startswith("float") else value
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return float(value) if is_number and PARAMETERS[name].allowed.startswith("float") else value
 
 
 def _listed(names) -> str:

@@ -23,9 +23,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights import integrators, loading, scenes, tree
+from manylights import loading, scenes, tree
 from manylights.bench import methods
 from manylights.errors import UsageError, one_line
+from manylights.loading import integrators
 from manylights.threads import threads_for_files
 
 WIDTH, HEIGHT = 160, 90
@@ -101,8 +102,7 @@ def find(text: str, defines: dict[str, str] | None = None) -> Source:
 def _file(path: str, defines: dict[str, str]) -> Source:
     try:
         with loading.search_beside(path), threads_for_files():
-            _, state = loading.parse(path, defines)
-            files = loading.files_of(state)
+            files = loading.parse(path, defines).files
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
@@ -125,15 +125,15 @@ def _file(path: str, defines: dict[str, str]) -> Source:
 
 def _load_file(path: str, defines: dict[str, str]) -> LoadedScene:
     with loading.search_beside(path), threads_for_files():
-        config, state = loading.parse(path, defines)
+        parsed = loading.parse(path, defines)
         plugin, parameters = "path", {}
-        for node in integrators.leaf_integrators(state):
+        for node in integrators.leaf_integrators(parsed.state):
             plugin, parameters = node.props.plugin_name(), dict(node.props.items())
-        for node in state.nodes:
+        for node in parsed.state.nodes:
             if node.type == mi.ObjectType.Sampler:
                 node.props = mi.Properties("independent")
-        media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
-        scene = loading.instantiate(config, state)
+        media = any(node.type == mi.ObjectType.Medium for node in parsed.state.nodes)
+        scene = loading.instantiate(parsed)
     return _describe(path, scene, plugin, parameters, media)
 
 
