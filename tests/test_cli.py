@@ -16,6 +16,7 @@ from manylights import __version__, cli, loading, rendering
 from manylights.errors import UsageError
 from manylights.loading import integrators
 from manylights.progress import Estimate, format_seconds
+from manylights.rendering import Job, plan
 
 from tests.conftest import heed_ctrl_c, require_variant
 
@@ -543,30 +544,30 @@ def test_version():
 @pytest.mark.parametrize("spp", [1, 3, 16, 100, 1000])
 @pytest.mark.parametrize("pixels", [1, 640 * 360, 3840 * 2160])
 def test_passes_add_up_and_are_bounded(spp, pixels):
-    sizes = rendering.pass_sizes(spp, pixels)
+    sizes = plan.pass_sizes(spp, pixels)
     assert sum(sizes) == spp
     assert min(sizes) >= 1
-    assert max(sizes) * pixels <= max(rendering.MAX_SAMPLES_PER_PASS, pixels)
+    assert max(sizes) * pixels <= max(plan.MAX_SAMPLES_PER_PASS, pixels)
     assert len(set(sizes[:-1])) <= 1
 
 
 def test_seeds_of_passes_differ_and_the_first_is_the_seed():
-    seeds = [rendering.pass_seed(seed, index) for seed in range(20) for index in range(20)]
+    seeds = [plan.pass_seed(seed, index) for seed in range(20) for index in range(20)]
     assert len(set(seeds)) == 400
-    assert rendering.pass_seed(7, 0) == 7
+    assert plan.pass_seed(7, 0) == 7
 
 
 def test_passes_give_the_mean_of_their_samples(llvm, monkeypatch):
     """Five passes are the mean of five renders, weighted by samples, in all channels."""
-    monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", 0)
+    monkeypatch.setattr(plan, "SINGLE_PASS_SAMPLES", 0)
     loaded = loading.load(str(SCENES / "aov.xml"), {"resx": "24", "resy": "16"})
     fractions = []
-    together = np.array(rendering.render(loaded, 0, 18, 3, fractions.append))
-    sizes = rendering.pass_sizes(18, 24 * 16)
+    together = np.array(rendering.render(Job.of(loaded, 0, 18, 3), fractions.append))
+    sizes = plan.pass_sizes(18, 24 * 16)
     assert fractions == pytest.approx(np.cumsum(sizes) / 18)
     expected = 0.0
     for index, size in enumerate(sizes):
-        seed = rendering.pass_seed(3, index)
+        seed = plan.pass_seed(3, index)
         mi.render(loaded.scene, seed=seed, spp=size)
         image = loaded.scene.sensors()[0].film().bitmap()
         expected = expected + np.array(image) * size / 18

@@ -232,6 +232,7 @@ def _render(options) -> None:
     from manylights import loading
     from manylights.loading import integrators
     from manylights.output import images
+    from manylights.rendering import Job
 
     target = images.check_output(options.output)
     defines = integrators.parse_assignments(options.define, "-D")
@@ -241,34 +242,29 @@ def _render(options) -> None:
     loaded = loading.load(options.scene, defines, options.integrator, settings)
     for note in loaded.notes:
         say(note)
-    checkpoint = None
-    if options.checkpoint is not None:
-        choices = {"integrator": options.integrator, "set": settings, "define": defines}
-        checkpoint = _open_checkpoint(loaded, target, options, choices)
-    _render_to(loaded, target, options, options.spp, options.sensor, checkpoint)
+    # What changes the image and is not in a file: a checkpoint of other choices is refused.
+    choices = {"integrator": options.integrator, "set": settings, "define": defines}
+    keeps_state = options.checkpoint is not None
+    job = Job.of(loaded, options.sensor, options.spp, options.seed, choices, keeps_state)
+    checkpoint = _open_checkpoint(job, target, options.checkpoint) if keeps_state else None
+    _render_to(job, target, options.threads, checkpoint)
 
 
-def _open_checkpoint(loaded, target, options, choices):
+def _open_checkpoint(job, target, seconds: float):
     """Return the checkpoint of a render, and say so if the render goes on from it."""
-    from manylights import checkpoint
+    from manylights.rendering.checkpoint import Checkpoint, path_for
 
-    job = checkpoint.describe_job(loaded, options.sensor, options.spp, options.seed, choices)
-    found = checkpoint.Checkpoint(checkpoint.path_for(target), job, options.checkpoint)
+    found = Checkpoint(path_for(target), job, seconds)
     if found.samples:
         say(f"checkpoint: {found.describe()}, the render goes on from there")
     return found
 
 
-def _render_to(loaded, target, options, spp: int, sensor: int = 0, checkpoint=None) -> float:
+def _render_to(job, target, threads: int | None = None, checkpoint=None) -> float:
     """Render with a progress bar, write the images, and return the seconds of the render."""
-    from manylights import rendering
     from manylights.output import images
     from manylights.progress import run_with_bar
-
-    def work(report):
-        return rendering.render(
-            loaded, sensor, spp, options.seed, report, options.threads, checkpoint
-        )
+    from manylights.rendering import render
 
     about_files = {}
     if checkpoint is not None:
@@ -278,7 +274,9 @@ def _render_to(loaded, target, options, spp: int, sensor: int = 0, checkpoint=No
             "begin": checkpoint.fraction,
         }
     start = time.perf_counter()
-    bitmap = run_with_bar("rendering", work, **about_files)
+    bitmap = run_with_bar(
+        "rendering", lambda report: render(job, report, threads, checkpoint), **about_files
+    )
     seconds = time.perf_counter() - start
     written, notes = images.write_images(bitmap, target)
     if checkpoint is not None:
@@ -306,6 +304,7 @@ def _demo(options) -> None:
     from manylights import loading, scenes, tree
     from manylights.loading import integrators
     from manylights.output import images
+    from manylights.rendering import Job
 
     target = images.check_output(f"{options.output}.exr")
     variant = _start(options)
@@ -321,7 +320,8 @@ def _demo(options) -> None:
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
     lights = sum(tree.count_kinds(loaded.scene).values())
     say(f"lights: {lights:,}")
-    seconds = _render_to(loaded, target, options, spp)
+    job = Job.of(loaded, spp=spp, seed=options.seed)
+    seconds = _render_to(job, target, options.threads)
     print(f"{lights:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")
 
 
