@@ -3,7 +3,7 @@
 ``manylights bench`` renders scenes with each method and writes times and errors to a folder;
 ``manylights compare`` compares two images. What each file does:
 
-- ``cli``: both commands; ``standard``: the scenes of ``--standard`` and ``--quick``;
+- ``standard``: the scenes of ``--standard`` and ``--quick``;
 - ``scene_source``: what SCENE may be; ``methods``: the methods and their integrators;
 - ``runner``: what is rendered in which order; ``calibration``: how many samples fit into a time;
   ``reference``: the image that errors are measured against; ``drawing``: one timed render;

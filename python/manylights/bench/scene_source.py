@@ -1,4 +1,6 @@
-"""What SCENE may be on the command line: an XML file, or a generator of ``manylights.scenes``.
+"""What SCENE may be on the command line: a file, or a generator of ``manylights.scenes``.
+
+A file is XML of Mitsuba, or a USD stage.
 
 A generator is written ``NAME[:LIGHTS][,KEY=VALUE]...``, as in ``city:1000,kind=points``. The keys
 are the arguments of the generator, and ``integrator``, ``max_depth``, ``rr_depth`` and
@@ -23,10 +25,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights import loading, scenes, tree
+from manylights import lights, loading, scenes
 from manylights.bench import methods
 from manylights.errors import UsageError, one_line
 from manylights.loading import integrators
+from manylights.loading.parsing import USD_ENDINGS
 from manylights.threads import threads_for_files
 
 WIDTH, HEIGHT = 160, 90
@@ -84,17 +87,18 @@ def find(text: str, defines: dict[str, str] | None = None) -> Source:
     """Find the scene that ``text`` names, and check what can be checked without loading it.
 
     Args:
-        text: an XML file or a call of a generator.
+        text: a scene file or a call of a generator.
         defines: values for the ``<default>`` parameters of XML files. Default: none.
 
     Raises:
         UsageError: there is no such file or generator, or it does not accept its arguments.
     """
-    if Path(text).suffix == ".xml" or Path(text).is_file():
+    if Path(text).suffix.lower() in (".xml", *USD_ENDINGS) or Path(text).is_file():
         return _file(text, defines or {})
     if _parse_call(text)[0] not in scenes.names():
         raise UsageError(
-            f"{text}: neither an XML file nor a generator, those are {', '.join(scenes.names())}"
+            f"{text}: neither an XML file nor a USD stage nor a generator, those are "
+            f"{', '.join(scenes.names())}"
         )
     return _generated(text)
 
@@ -140,10 +144,9 @@ def _load_file(path: str, defines: dict[str, str]) -> LoadedScene:
 def _generated(text: str) -> Source:
     name, arguments, settings = _parse_call(text)
     # A small one of the same kind: names and values are checked before anything is measured.
-    lights = arguments.get("n_lights", 10)
-    _generate(
-        text, name, {**arguments, "n_lights": lights if lights > 1_000_000 else min(lights, 10)}
-    )
+    count = arguments.get("n_lights", 10)
+    few = count if count > 1_000_000 else min(count, 10)
+    _generate(text, name, {**arguments, "n_lights": few})
     content = json.dumps([name, arguments, settings], sort_keys=True, default=str)
     from manylights import __version__
 
@@ -167,15 +170,15 @@ def _generated(text: str) -> Source:
 def _parse_call(text: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Split a call into the generator's name, its arguments, and settings of the integrator."""
     head, *items = text.split(",")
-    name, separator, lights = head.partition(":")
-    if separator and "=" in lights:
-        items, lights = [lights, *items], ""
+    name, separator, count = head.partition(":")
+    if separator and "=" in count:
+        items, count = [count, *items], ""
     arguments: dict[str, Any] = {}
     settings: dict[str, Any] = {}
-    if lights:
-        if not lights.isdigit():
-            raise UsageError(f"{text}: {lights!r} is not a number of lights")
-        arguments["n_lights"] = int(lights)
+    if count:
+        if not count.isdigit():
+            raise UsageError(f"{text}: {count!r} is not a number of lights")
+        arguments["n_lights"] = int(count)
     for item in items:
         key, equals, value = item.partition("=")
         if not equals or not key:
@@ -217,8 +220,8 @@ def _describe(
         kind = methods.kind_of(plugin, parameters, media)
     except UsageError as error:
         raise UsageError(f"{text}: {error}") from error
-    lights = sum(tree.count_kinds(scene).values())
-    return LoadedScene(scene, kind, lights, media)
+    count = sum(lights.count_kinds(scene).values())
+    return LoadedScene(scene, kind, count, media)
 
 
 def _plain(text: str) -> str:
