@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -14,9 +15,17 @@ import pytest
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from manylights.bench import metrics
+from manylights.bench import metrics, records
 from manylights.errors import UsageError
-from manylights.report import charts, grouping, page, pictures, results, sheets, statistics, tables
+from manylights.report import (
+    charts,
+    grouping,
+    page,
+    pictures,
+    sheets,
+    statistics,
+    tables,
+)
 
 from tests import browser, report_data
 from tests.test_cli import assert_fails, manylights
@@ -39,7 +48,7 @@ def text(folder):
 
 @pytest.fixture
 def data(folder):
-    return results.load(folder)
+    return records.load(folder)
 
 
 @pytest.fixture
@@ -100,15 +109,15 @@ def series_of(points, method="talk", **parameters):
     for spp, seconds, error in points:
         spread = np.array([0.99, 1.0, 1.01])
         errors = error * spread
-        made.append(results.Point(spp, seconds * np.ones(3), np.ones(3), errors, errors, spread))
-    return results.Series(method, method, parameters, 0.0, 0.0, None, made)
+        made.append(records.Point(spp, seconds * np.ones(3), np.ones(3), errors, errors, spread))
+    return records.Series(method, method, parameters, 0.0, 0.0, None, made)
 
 
 def scene_of(*series, error=0.0, mean=1.0, mean_error=0.0):
     reference = {"error": error, "mean": mean, "mean_error": mean_error}
-    fields = {name: None for name in results.SCENE}
+    fields = {field.name: None for field in dataclasses.fields(records.Scene)}
     fields.update(reference=reference, series=list(series), width=10, height=10, lights=1)
-    return results.Scene(None, **fields)
+    return records.Scene(**fields)
 
 
 def test_gain_is_the_ratio_of_error_times_time():
@@ -269,12 +278,12 @@ def test_losses_are_on_the_page(text):
 
 
 def test_without_losses_the_page_says_so(small, undrawn):
-    text, _ = page.render(results.load(small()), publish=False)
+    text, _ = page.render(records.load(small()), publish=False)
     assert "In none of 2 comparisons" in text
 
 
 def test_private_pictures_stay_out_of_what_is_published(small, undrawn):
-    data = results.load(small(private=True, source="secret/room.xml"))
+    data = records.load(small(private=True, source="secret/room.xml"))
     text, _ = page.render(data, publish=False)
     sheet = data.folder / "charts" / "pictures_room.svg"
     assert sheet.exists()
@@ -289,7 +298,7 @@ def test_private_scenes_need_no_pictures_to_be_published(small, undrawn):
     path = small(private=True)
     for image in (path / "room").iterdir():
         image.unlink()
-    text, _ = page.render(results.load(path), publish=True)
+    text, _ = page.render(records.load(path), publish=True)
     assert '<th scope="row">Room</th>' in text
 
 
@@ -297,7 +306,7 @@ def test_titles_are_escaped(small, undrawn):
     def change(data):
         data["scenes"][0]["title"] = "<b>A & B</b>"
 
-    text, _ = page.render(results.load(small(change)), publish=False)
+    text, _ = page.render(records.load(small(change)), publish=False)
     assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in text and "<b>A &" not in text
 
 
@@ -308,7 +317,7 @@ def test_few_seeds(small, seeds):
             for name in ("seconds", "cpu_seconds", "error", "error_trimmed", "mean"):
                 point[name] = point[name][:seeds]
 
-    text, _ = page.render(results.load(small(change)), publish=False)
+    text, _ = page.render(records.load(small(change)), publish=False)
     assert ("one seed" in text) is (seeds == 1)
 
 
@@ -318,7 +327,7 @@ def test_only_one_method_and_one_point(small):
         scene["series"] = scene["series"][:1]
         scene["series"][0].update(equal_time=None, points=scene["series"][0]["points"][:1])
 
-    text, _ = page.render(results.load(small(change)), publish=False)
+    text, _ = page.render(records.load(small(change)), publish=False)
     assert "nothing to compare" in text
 
 
@@ -332,7 +341,7 @@ def test_an_interrupted_run_is_shown_as_far_as_it_came(small, undrawn):
                 values.clear()
         data["scenes"].append({**scene, "name": "next", "reference": None, "series": []})
 
-    data = results.load(small(change))
+    data = records.load(small(change))
     assert [[series.spec for series in scene.series] for scene in data.scenes] == [
         ["talk", "resampled_tree"]
     ]
@@ -343,14 +352,14 @@ def test_an_interrupted_run_is_shown_as_far_as_it_came(small, undrawn):
 
 
 def test_no_scenes(small):
-    text, _ = page.render(results.load(small(lambda data: data["scenes"].clear())), publish=False)
+    text, _ = page.render(records.load(small(lambda data: data["scenes"].clear())), publish=False)
     assert "0 scenes" in text
 
 
 def test_missing_maps_are_left_out_with_a_remark(small, undrawn):
     path = small()
     (path / "room" / "talk.maps.exr").unlink()
-    text, remarks = page.render(results.load(path), publish=False)
+    text, remarks = page.render(records.load(path), publish=False)
     assert any("talk.maps.exr" in remark for remark in remarks)
     assert "talk.maps.exr" in text and "resampled_tree.maps.exr" not in text
 
@@ -358,14 +367,14 @@ def test_missing_maps_are_left_out_with_a_remark(small, undrawn):
 def test_maps_without_channels_are_told(small, undrawn):
     path = small()
     report_data.write_exr(path / "room" / "talk.maps.exr", np.ones((45, 80, 3)))
-    _, remarks = page.render(results.load(path), publish=False)
+    _, remarks = page.render(records.load(path), publish=False)
     assert remarks == ["room/talk.maps.exr: has no channel candidates, node_visits"]
 
 
 def test_missing_variance_is_left_out_with_a_remark(small):
     path = small(boundary=True)
     (path / "room" / "talk.variance.exr").unlink()
-    _, remarks = page.render(results.load(path), publish=False)
+    _, remarks = page.render(records.load(path), publish=False)
     assert any("talk.variance.exr" in remark for remark in remarks)
     assert (path / "charts" / "boundary_room.svg").exists()
 
@@ -430,7 +439,7 @@ def repeat_scene(data):
 def test_wrong_results_are_refused(small, change, words):
     path = small(change)
     with pytest.raises(UsageError, match=words) as raised:
-        results.load(path)
+        records.load(path)
     assert "results.json" in str(raised.value)
 
 
@@ -447,14 +456,14 @@ def test_broken_image_is_refused(small):
     path = small()
     (path / "room" / "talk.exr").write_bytes(b"no image")
     with pytest.raises(UsageError, match=r"talk\.exr: not a readable image"):
-        page.render(results.load(path), publish=False)
+        page.render(records.load(path), publish=False)
 
 
 def test_image_of_another_size_is_refused(small):
     path = small()
     report_data.write_exr(path / "room" / "talk.exr", np.ones((4, 6, 3)))
     with pytest.raises(UsageError, match=r"talk\.exr: 6 x 4 pixels instead of 80 x 45"):
-        page.render(results.load(path), publish=False)
+        page.render(records.load(path), publish=False)
 
 
 def test_page_that_cannot_be_written(folder, tmp_path):

@@ -7,6 +7,8 @@
 - ``scene_source``: what SCENE may be; ``methods``: the methods and their integrators;
 - ``runner``: what is rendered in which order; ``calibration``: how many samples fit into a time;
   ``reference``: the image that errors are measured against; ``drawing``: one timed render;
-- ``results``: the file of results; ``moments``: variances over seeds; ``workload``: the time left;
-- ``metrics``: errors; ``compare``: the command of that name; ``extras``: packages needed.
+- ``records``: what is in results.json; ``folder``: where it and the images are; ``machine``: what
+  they were measured on;
+- ``moments``: variances over seeds; ``workload``: the time left;
+- ``metrics``: errors; ``compare``: two images; ``extras``: packages needed.
 """

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from manylights.bench.scene_source import LoadedScene
+from manylights.bench.scene_source import MeasuredScene
 from manylights.errors import UsageError
 from manylights.rendering import plan as plans
 
@@ -29,7 +29,7 @@ class Drawing:
     cpu_seconds: float
 
 
-def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
+def draw(loaded: MeasuredScene, integrator, spp: int, seed: int) -> Drawing:
     """Render a scene and measure how long that takes, until the pixels are in memory.
 
     Args:
@@ -53,7 +53,7 @@ def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
 
 
 def draw_channels(
-    loaded: LoadedScene, integrator, spp: int, seed: int, names: tuple[str, ...]
+    loaded: MeasuredScene, integrator, spp: int, seed: int, names: tuple[str, ...]
 ) -> np.ndarray:
     """Render a scene and return those channels that the integrator adds under these names."""
     pixels = np.array(integrator.render(loaded.scene, sensor=0, seed=seed, spp=spp))
@@ -61,7 +61,7 @@ def draw_channels(
     return pixels[..., [added.index(name) - len(added) for name in names]]
 
 
-def _render(loaded: LoadedScene, integrator, spp: int, seed: int) -> np.ndarray:
+def _render(loaded: MeasuredScene, integrator, spp: int, seed: int) -> np.ndarray:
     """Render in as many passes as the memory needs; each sample has the same weight."""
     width, height = loaded.size
     plan = plans.whole(spp, seed)

@@ -18,7 +18,7 @@ import numpy as np
 from manylights.bench import methods, metrics
 from manylights.bench.drawing import draw
 from manylights.bench.moments import Moments
-from manylights.bench.scene_source import LoadedScene
+from manylights.bench.scene_source import MeasuredScene
 from manylights.errors import UsageError
 from manylights.output import channels
 
@@ -31,7 +31,7 @@ FIRST_SEED = 2**31
 
 
 def render(
-    loaded: LoadedScene, spp: int, advance: Callable[[float], None]
+    loaded: MeasuredScene, spp: int, advance: Callable[[float], None]
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Render a reference of ``PASSES`` times ``spp`` samples.
 

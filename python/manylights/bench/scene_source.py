@@ -42,7 +42,7 @@ TEXTURED = ("city", "fog_open", "fog_rooms", "fog_street", "glossy", "rooms")
 
 
 @dataclass
-class LoadedScene:
+class MeasuredScene:
     """A scene in memory and what is to be known about it.
 
     Attributes:
@@ -80,7 +80,7 @@ class Source:
     name: str
     family: str
     fingerprint: str
-    load: Callable[[], LoadedScene]
+    load: Callable[[], MeasuredScene]
 
 
 def find(text: str, defines: dict[str, str] | None = None) -> Source:
@@ -116,7 +116,7 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     for file in files:
         digest.update(file.read_bytes())
 
-    def load() -> LoadedScene:
+    def load() -> MeasuredScene:
         try:
             return _load_file(path, defines)
         except RuntimeError as error:
@@ -127,7 +127,7 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     return Source(text, name, name, digest.hexdigest(), load)
 
 
-def _load_file(path: str, defines: dict[str, str]) -> LoadedScene:
+def _load_file(path: str, defines: dict[str, str]) -> MeasuredScene:
     with loading.search_beside(path), threads_for_files():
         parsed = loading.parse(path, defines)
         plugin, parameters = "path", {}
@@ -154,7 +154,7 @@ def _generated(text: str) -> Source:
     rest = [f"{key}={value}" for key, value in (*arguments.items(), *settings.items())]
     rest = [item for item in rest if not item.startswith("n_lights=")]
 
-    def load() -> LoadedScene:
+    def load() -> MeasuredScene:
         description = _generate(text, name, arguments)
         chosen = dict(description["integrator"])
         plugin = settings.get("integrator", chosen.pop("type"))
@@ -215,13 +215,13 @@ def _quiet():
 
 def _describe(
     text: str, scene, plugin: str, parameters: dict[str, Any], media: bool
-) -> LoadedScene:
+) -> MeasuredScene:
     try:
         kind = methods.kind_of(plugin, parameters, media)
     except UsageError as error:
         raise UsageError(f"{text}: {error}") from error
     count = sum(lights.count_kinds(scene).values())
-    return LoadedScene(scene, kind, count, media)
+    return MeasuredScene(scene, kind, count, media)
 
 
 def _plain(text: str) -> str:

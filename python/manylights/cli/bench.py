@@ -8,9 +8,10 @@ from dataclasses import replace
 from manylights import loading
 from manylights.bench import (
     extras,
+    folder,
     methods,
+    records,
     reference,
-    results,
     runner,
     scene_source,
     standard,
@@ -102,16 +103,16 @@ def _run(options) -> None:
     extras.require("flip_evaluator", "flip-evaluator")
     variant = loading.set_variant(options.variant)
     say(f"variant: {variant}")
-    jobs = _jobs(options)
-    found = results.open_folder(options.out, variant)
+    tasks = _tasks(options)
+    found = folder.open_folder(options.out, variant)
     settings = runner.Settings(options.spp, _budget(options), options.seeds)
     run_with_bar(
         "measuring",
-        lambda report: runner.run(jobs, settings, found, report),
+        lambda report: runner.run(tasks, settings, found, report),
         found.writing,
         lambda: f"interrupted, what was measured is in {found.folder}; the same command goes on",
     )
-    say(f"wrote {found.folder / results.NAME}")
+    say(f"wrote {found.folder / records.FILE}")
 
 
 def _budget(options) -> float:
@@ -119,7 +120,7 @@ def _budget(options) -> float:
     return default if options.time_budget is None else options.time_budget
 
 
-def _jobs(options) -> list[runner.Job]:
+def _tasks(options) -> list[runner.Task]:
     """Return what is to be measured.
 
     Raises:
@@ -127,24 +128,24 @@ def _jobs(options) -> list[runner.Job]:
     """
     defines = shared.defines(options)
     chosen = _methods(options.methods)
-    jobs = standard.standard() if options.standard else standard.quick() if options.quick else []
+    tasks = standard.standard() if options.standard else standard.quick() if options.quick else []
     if chosen is not None:
-        jobs = [replace(job, methods=chosen) for job in jobs]
+        tasks = [replace(task, methods=chosen) for task in tasks]
     for text, private in [*((s, False) for s in options.scene), *((s, True) for s in options.also)]:
         source = scene_source.find(text, defines)
-        jobs.append(runner.Job(source, chosen or standard.all_methods(), private=private))
-    if not jobs:
+        tasks.append(runner.Task(source, chosen or standard.all_methods(), private=private))
+    if not tasks:
         raise UsageError("bench: name a SCENE, --standard or --quick")
-    methods.check_values([method for job in jobs for method in job.methods])
+    methods.check_values([method for task in tasks for method in task.methods])
     if options.reference is None:
-        return jobs
-    if len(jobs) != 1:
-        raise UsageError(f"--reference {options.reference}: needs one SCENE, not {len(jobs)}")
+        return tasks
+    if len(tasks) != 1:
+        raise UsageError(f"--reference {options.reference}: needs one SCENE, not {len(tasks)}")
     # Errors against another reference are other numbers: the scene is measured again.
-    source = jobs[0].source
+    source = tasks[0].source
     digest = f"{source.fingerprint} {reference.fingerprint(options.reference)}"
     source = replace(source, fingerprint=digest)
-    return [replace(jobs[0], source=source, reference=options.reference)]
+    return [replace(tasks[0], source=source, reference=options.reference)]
 
 
 def _methods(text: str | None) -> list[methods.Method] | None:

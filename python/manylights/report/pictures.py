@@ -13,10 +13,10 @@ import matplotlib.image
 import numpy as np
 
 from manylights.bench import metrics
+from manylights.bench.records import Scene, Series
 from manylights.errors import UsageError
 from manylights.output import channels
 from manylights.report import grouping
-from manylights.report.results import Scene, Series
 
 #: Share of the reference's pixels that the exposure leaves below white.
 BELOW_WHITE = 0.97
