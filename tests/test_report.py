@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,12 +21,14 @@ from manylights.errors import UsageError
 from manylights.report import (
     charts,
     grouping,
+    markdown,
     page,
     pictures,
     sheets,
     statistics,
     tables,
 )
+from manylights.report.text import number
 
 from tests import browser, report_data
 from tests.test_cli import assert_fails, manylights
@@ -252,6 +255,62 @@ def test_charts_have_stable_names(folder):
     stems += [f"sweep_{name}_city_10000" for name in grouping.SWEPT]
     for stem in stems:
         assert {f"{stem}.svg", f"{stem}.png"} <= names
+
+
+def test_readme_has_the_tables(folder):
+    """Beside the results, with the charts that there are, and without what is private."""
+    readme = (folder / "README.md").read_text()
+    charts = re.findall(r"!\[[^\]]+\]\((\S+)\)", readme)
+    assert charts == ["charts/overview.svg", "charts/lights_city.svg", "charts/boundary_step.svg"]
+    assert all((folder / chart).is_file() for chart in charts)
+    assert "private/works.xml" not in readme
+    data = records.load(folder)
+    for scene in data.scenes:
+        (row,) = re.findall(rf"^\| {re.escape(scene.title)} \| [\d,]+ \| .*, .* \|$", readme, re.M)
+        gains = dict(zip(readme_methods(readme), row.strip("| ").split(" | ")[3:]))
+        for peer in grouping.one_a_method(scene)[1:]:
+            ratio = statistics.gain(peer, grouping.ours(scene), scene)
+            assert gains[peer.method] == number(ratio.value)
+
+
+def readme_methods(readme):
+    """The methods in the heading of the first table."""
+    return re.findall(r"`(\w+)`", next(line for line in readme.splitlines() if "| scene" in line))
+
+
+def test_readme_of_the_repository_is_what_the_command_writes():
+    """Nobody has edited it, and nobody has forgotten to write it again."""
+    committed = Path(__file__).parents[1] / "scenes" / "bench"
+    text = markdown.render(records.load(committed), committed / "charts")
+    assert (committed / "README.md").read_text() == text
+    assert "](more.md)" in text
+
+
+def test_a_readme_by_hand_stays(small, undrawn):
+    path = small()
+    (path / "README.md").write_text("Measured on a rainy day.\n")
+    _, remarks = page.write_report(path, None, publish=False)
+    assert any("README.md: not written by this command" in remark for remark in remarks)
+    assert (path / "README.md").read_text() == "Measured on a rainy day.\n"
+    (path / "README.md").unlink()
+    for _ in range(2):
+        _, remarks = page.write_report(path, None, publish=False)
+        assert not any("README.md" in remark for remark in remarks)
+    assert (path / "README.md").read_text().startswith("# Measurements")
+
+
+def test_readme_of_few_results(small, undrawn):
+    """One scene of one method, and no scene."""
+
+    def one(data):
+        data["scenes"][0]["series"] = data["scenes"][0]["series"][2:]
+
+    for change in (one, lambda data: data["scenes"].clear()):
+        data = records.load(small(change))
+        text = markdown.render(data, data.folder / "charts")
+        assert text.startswith("# Measurements") and "Time to the same error" not in text
+        for scene in list(data.folder.glob("room")):
+            shutil.rmtree(scene)
 
 
 def test_page_needs_no_other_file(text):

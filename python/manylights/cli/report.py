@@ -8,8 +8,9 @@ from manylights.errors import UsageError
 
 HELP = """\
 Reads what "manylights bench" wrote to DIR and makes one HTML page of it that needs no other
-file. Its charts are also written to DIR/charts as PNG and SVG: overview, error_time_SCENE,
-reach_ERROR, lights_FAMILY, sweep_PARAMETER_SCENE, boundary_SCENE and pictures_SCENE.
+file, and DIR/README.md with the most important tables. The page's charts are also written to
+DIR/charts as PNG and SVG: overview, error_time_SCENE, reach_ERROR, lights_FAMILY,
+sweep_PARAMETER_SCENE, boundary_SCENE and pictures_SCENE.
 """
 
 #: Packages that only this command and the measuring need.

@@ -2,6 +2,6 @@
 
 ``bench.records`` reads and checks the measurements, ``statistics`` has means and intervals,
 ``grouping`` decides what is compared with what. ``charts``, ``pictures``, ``sheets`` and ``tables``
-make the parts, ``page`` puts them together. None of it is imported by
+make the parts, ``page`` and ``markdown`` put them together. None of it is imported by
 ``import manylights``.
 """

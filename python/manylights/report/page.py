@@ -10,7 +10,7 @@ import jinja2
 from manylights import files
 from manylights.bench import records
 from manylights.bench.methods import ABOUT
-from manylights.report import charts, grouping, pictures, sheets, statistics, tables
+from manylights.report import charts, grouping, markdown, pictures, sheets, statistics, tables
 from manylights.report.text import number, percent, ratio
 
 PAGE_NAME, CHART_FOLDER = "report.html", "charts"
@@ -28,7 +28,7 @@ class Steps:
 
 
 def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, list[str]]:
-    """Write the page and the charts.
+    """Write the page, the charts, and README.md beside the results.
 
     Args:
         folder: what ``manylights bench`` wrote.
@@ -36,13 +36,14 @@ def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, 
         publish: leave out pictures and file names of private scenes.
 
     Returns:
-        The page's path, and remarks on what was left out.
+        The page's path, and remarks on what was left out or left as it is.
     """
     data = records.load(folder)
     target = files.check_output(output or str(data.folder / PAGE_NAME))
     text, remarks = render(data, publish)
     with files.written_whole(target) as partial:
         partial.write_text(text, encoding="utf-8")
+    remarks += markdown.write_readme(data, data.folder / CHART_FOLDER)
     return target, remarks
 
 
