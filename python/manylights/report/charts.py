@@ -21,6 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from manylights.bench.methods import ABOUT, SWEPT
 from manylights.bench.records import Results, Scene, Series
+from manylights.loading.integrators import value_text
 from manylights.report import grouping
 from manylights.report.statistics import (
     CLEARLY_ABOVE,
@@ -352,7 +353,7 @@ def _sweeps(results: Results) -> Iterator[tuple]:
             groups = grouping.sweeps(scene, parameter)
             if groups:
                 title = f"{scene.title}: {parameter} ({SWEPT[parameter].symbol})"
-                values = ", ".join(grouping.value_text(value) for value, _ in groups[0])
+                values = ", ".join(value_text(value) for value, _ in groups[0])
                 alt = f"Error and time against {parameter} ({values}) in {scene.title}."
                 figure = _sweep(scene, parameter, groups)
                 yield f"sweep_{parameter}_{scene.name}", title, alt, figure

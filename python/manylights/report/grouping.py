@@ -7,6 +7,7 @@ from typing import Any
 
 from manylights.bench.methods import SWEPT
 from manylights.bench.records import Results, Scene, Series
+from manylights.loading.integrators import value_text
 from manylights.report.statistics import cost
 
 #: A sweep with fewer values is no curve.
@@ -20,11 +21,6 @@ def label(series: Series, without: str = "") -> str:
         name = f"{series.method} (Mitsuba)"
     settings = [f"{key} {value_text(value)}" for key, value in series.parameters.items()]
     return ", ".join([name] + [text for text in settings if text.split()[0] != without])
-
-
-def value_text(value: Any) -> str:
-    """Write the value of a parameter; whole numbers without a point."""
-    return f"{value:g}" if isinstance(value, (int, float)) else str(value)
 
 
 def ours(scene: Scene) -> Series | None:
