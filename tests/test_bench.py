@@ -17,11 +17,12 @@ from manylights.bench import (
     calibration,
     drawing,
     methods,
-    results,
+    records,
     runner,
     scene_source,
     standard,
 )
+from manylights.bench.folder import open_folder
 from manylights.bench.methods import Kind, Method
 from manylights.bench.moments import Moments
 from manylights.bench.workload import Workload
@@ -527,7 +528,7 @@ def test_scenes_of_one_name_get_numbers(tmp_path, scalar_variant):
         (tmp_path / folder).mkdir()
         shutil.copy(SCENES / "points.xml", tmp_path / folder / "points.xml")
         sources.append(scene_source.find(str(tmp_path / folder / "points.xml")))
-    found = results.open_folder(str(tmp_path / "out"), "scalar_rgb")
+    found = open_folder(str(tmp_path / "out"), "scalar_rgb")
     names = [found.scene(source, name=source.name)["name"] for source in sources]
     assert names == ["points", "points_2"]
     assert found.scene(sources[1], name="points") is found.data["scenes"][1]
@@ -590,6 +591,18 @@ def test_workload_reaches_one():
     assert fractions == pytest.approx([0.25, 2 / 3, 1.0])
 
 
+def test_every_method_is_described():
+    assert set(methods.ABOUT) == set(methods.NAMES) == {*methods.MITSUBAS, *methods.OURS}
+    assert len({about.color for about in methods.ABOUT.values()}) == len(methods.NAMES)
+    assert len({about.marker for about in methods.ABOUT.values()}) == len(methods.NAMES)
+
+
+def test_a_new_point_has_a_list_a_seed():
+    point = records.new_point(4)
+    assert point.pop("spp") == 4
+    assert set(point) == POINT_KEYS - {"spp"} and not any(point.values())
+
+
 def test_the_missing_extra_is_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     assert_fails(capsys, (CITY, "--out", tmp_path), "flip-evaluator", "manylights[bench]")
@@ -597,7 +610,7 @@ def test_the_missing_extra_is_named(monkeypatch, capsys, tmp_path):
 
 def test_importing_the_package_imports_no_extra():
     code = (
-        "import sys, manylights, manylights.cli; manylights.cli._parser(); "
+        "import sys; from manylights.cli.main import parser; parser(); "
         "extras = ('matplotlib', 'scipy', 'jinja2', 'flip_evaluator'); "
         "print(*[name for name in extras if name in sys.modules])"
     )

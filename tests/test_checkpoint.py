@@ -12,9 +12,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import checkpoint, cli, images, loading, rendering
+from manylights import cli, loading
 from manylights.errors import UsageError
+from manylights.output import images
 from manylights.progress import Estimate
+from manylights.rendering import Job, checkpoint, passes, plan
+from manylights.rendering.sums import Sums
 
 from tests.conftest import heed_ctrl_c, require_variant
 
@@ -43,9 +46,10 @@ WIDE = (
 #: A render in many short passes.
 CHILD = """
 import sys
-from manylights import cli, rendering
-rendering.SINGLE_PASS_SAMPLES = 0
-rendering.MAX_SAMPLES_PER_PASS = rendering.MAX_SAMPLES_PER_SCALAR_PASS = 2**15
+from manylights import cli
+from manylights.rendering import plan
+plan.SINGLE_PASS_SAMPLES = 0
+plan.MAX_SAMPLES_PER_PASS = plan.MAX_SAMPLES_PER_SCALAR_PASS = 2**15
 {before}
 sys.exit(cli.main(sys.argv[1:]))
 """
@@ -104,9 +108,9 @@ def names(folder):
 @pytest.fixture
 def short_passes(monkeypatch):
     """Also small images are rendered in many passes."""
-    monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", 0)
+    monkeypatch.setattr(plan, "SINGLE_PASS_SAMPLES", 0)
     for name in ("MAX_SAMPLES_PER_PASS", "MAX_SAMPLES_PER_SCALAR_PASS"):
-        monkeypatch.setattr(rendering, name, 2**11)
+        monkeypatch.setattr(plan, name, 2**11)
 
 
 @pytest.fixture
@@ -136,16 +140,16 @@ def run(short_passes, wide, tmp_path, capsys):
 def interrupt(monkeypatch, run):
     """A function that renders with `run` until some passes are done, 3 by default of 5."""
 
-    def render(*arguments, passes=3, **options):
-        render_pass = rendering._render_pass
+    def render(*arguments, done=3, **options):
+        render_pass = passes.render_pass
 
-        def render_first(loaded, sensor, sizes, index, *rest):
-            if index == passes:
+        def render_first(job, part, report):
+            if part.index == done:
                 raise RuntimeError("interrupted by the test")
-            return render_pass(loaded, sensor, sizes, index, *rest)
+            return render_pass(job, part, report)
 
         with monkeypatch.context() as patch:
-            patch.setattr(rendering, "_render_pass", render_first)
+            patch.setattr(passes, "render_pass", render_first)
             status, log = run(*arguments, **options)
         assert status == 2 and "interrupted by the test" in log
         return log
@@ -225,8 +229,8 @@ def test_wide_filters_and_further_channels_go_on_to_the_same_bits(
 ):
     variant = require_variant(variant)
     assert run(variant=variant, out="whole.exr")[0] == 0
-    interrupt(variant=variant, passes=1)
-    interrupt(variant=variant, passes=3)
+    interrupt(variant=variant, done=1)
+    interrupt(variant=variant, done=3)
     status, log = run(variant=variant)
     assert status == 0 and "has 24 of 36 samples per pixel" in log
     assert pixels(tmp_path / "out.exr") == pixels(tmp_path / "whole.exr")
@@ -413,19 +417,19 @@ def test_checkpoints_are_written_when_it_is_time(wide, short_passes, monkeypatch
     """After the pass that goes past it, counted from the end of the last writing."""
     mi.set_variant("scalar_rgb")
     loaded = loading.load(str(wide))
-    job = checkpoint.describe_job(loaded, 0, 36, 0, {})
+    job = Job.of(loaded, 0, 36, 0, keeps_state=True)
     now, written = [0.0], []
 
-    def write_slowly(self, film):
+    def write_slowly(self):
         written.append(self.sums.passes)
         now[0] += 3.0
 
     monkeypatch.setattr(checkpoint.Checkpoint, "_write", write_slowly)
     kept = checkpoint.Checkpoint(tmp_path / "c.exr", job, 10.0, clock=lambda: now[0])
-    for passes, time_of_pass in enumerate((9.0, 0.5, 1.0, 9.5, 0.6, 30.0), 1):
+    for done, time_of_pass in enumerate((9.0, 0.5, 1.0, 9.5, 0.6, 30.0), 1):
         now[0] += time_of_pass
-        kept.sums.passes = passes
-        kept.keep(None)
+        kept.sums.passes = done
+        kept.keep()
     assert written == [3, 5, 6]
 
 
@@ -449,7 +453,7 @@ def test_bar_starts_at_the_fraction_that_is_done():
 
 def test_sums_of_many_passes_are_exact_to_48_bits():
     generator = np.random.default_rng(3)
-    sums, exact = rendering.Sums(), np.zeros((4, 5, 2), np.longdouble)
+    sums, exact = Sums(), np.zeros((4, 5, 2), np.longdouble)
     for _ in range(2000):
         # From 1e-4 to 1e4: what is bright rounds what is dark away in single precision.
         raw = (10 ** generator.uniform(-4, 4, exact.shape)).astype(np.float32)
@@ -461,7 +465,7 @@ def test_sums_of_many_passes_are_exact_to_48_bits():
 
 
 def test_infinite_and_undefined_channels_stay_so():
-    sums = rendering.Sums()
+    sums = Sums()
     for values in ([1.0, np.inf, 1.0, 3e38], [1.0, 2.0, np.nan, 3e38], [1.0, 2.0, 1.0, 3e38]):
         sums.add(np.array([[values]], np.float32))
     np.testing.assert_array_equal(sums.high, [[[3.0, np.inf, np.nan, np.inf]]])
@@ -480,15 +484,17 @@ def test_infinite_and_undefined_channels_stay_so():
 def test_passes_are_short_and_stratify(variant, width, height, size):
     """Four million samples, or four per pixel; in JIT variants what the memory bounds."""
     variant = require_variant(variant)
-    film = mi.load_dict({"type": "hdrfilm", "width": width, "height": height})
-    assert rendering.checkpointed_sizes(film, 1000)[0] == size
+    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": width, "height": height}}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor})
+    job = Job.of(loading.LoadedScene(scene, 1, []), spp=1000, keeps_state=True)
+    assert job.plan.samples_per_pass == size and job.plan.spp == 1000
 
 
 @pytest.mark.parametrize("pixels", [1024 * 1024, 1024 * 768, 1920 * 1080])
 def test_no_pass_repeats_another_in_scalar_variants(pixels):
     """Mitsuba multiplies the seed by the number of pixels, in 32 bits."""
     for seed in range(5):
-        seeds = {rendering.pass_seed(seed, index) * pixels % 2**32 for index in range(4096)}
+        seeds = {plan.pass_seed(seed, index) * pixels % 2**32 for index in range(4096)}
         assert len(seeds) == 4096
 
 
@@ -496,7 +502,7 @@ def test_tracers_of_particles_are_as_bright_in_passes(run, monkeypatch, tmp_path
     """They divide by the samples of a pass themselves."""
     means = []
     for name, single in (("passes", 0), ("whole", 2**20)):
-        monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", single)
+        monkeypatch.setattr(plan, "SINGLE_PASS_SAMPLES", single)
         out = f"{name}.exr"
         arguments = ("--integrator", "ptracer", "--spp", 256, "-D", "resx=24", "-D", "resy=16")
         assert run(*arguments, variant=llvm, out=out, scene=SCENES / "points.xml")[0] == 0

@@ -12,9 +12,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import __version__, cli, integrators, loading, rendering
+from manylights import __version__, cli, loading, rendering
 from manylights.errors import UsageError
+from manylights.loading import integrators
 from manylights.progress import Estimate, format_seconds
+from manylights.rendering import Job, plan
 
 from tests.conftest import heed_ctrl_c, require_variant
 
@@ -99,7 +101,7 @@ def choose(tmp_path):
     def run(text, wanted=None, **settings):
         path = tmp_path / "chosen.xml"
         path.write_text(f'<scene version="3.0.0">{text}</scene>')
-        _, state = loading.parse(str(path), {})
+        state = loading.parse(str(path)).state
         notes = integrators.choose(state, wanted, settings)
         leaves = integrators.leaf_integrators(state)
         if not leaves:
@@ -287,8 +289,9 @@ def test_unknown_parameters_are_refused_with_those_of_the_integrator(choose, plu
 def test_listed_parameters_are_those_of_the_plugin(plugin):
     """The plugin accepts all that the help lists, and the defaults are those it states."""
     mi.set_variant("scalar_rgb")
-    for name, meaning in integrators.PARAMETERS[plugin].items():
-        default = integrators.parse_value(meaning.rpartition("default ")[2].split(",")[0])
+    for name, parameter in integrators.PARAMETERS[plugin].items():
+        default = integrators.parse_value(str(parameter).rpartition("default ")[2].split(",")[0])
+        assert default == parameter.default
         needed = {"method": "talk"} if name == "split_function" else {}
         untouched = mi.load_dict({"type": plugin, **needed})
         assert str(mi.load_dict({"type": plugin, name: default, **needed})) == str(untouched)
@@ -301,7 +304,7 @@ def test_parameters_of_the_tree_are_found(tmp_path, plugin):
     hidden = '<boolean name="hide_emitters" value="true"/>'
     parameters = f'<float name="splitting_rate" value="2"/>{hidden}'
     path.write_text(f'<scene version="3.0.0">{integrator(plugin, parameters)}</scene>')
-    _, state = loading.parse(str(path), {})
+    state = loading.parse(str(path)).state
     assert integrators.ours_in(state) == (plugin, {"splitting_rate": 2.0})
 
 
@@ -541,30 +544,30 @@ def test_version():
 @pytest.mark.parametrize("spp", [1, 3, 16, 100, 1000])
 @pytest.mark.parametrize("pixels", [1, 640 * 360, 3840 * 2160])
 def test_passes_add_up_and_are_bounded(spp, pixels):
-    sizes = rendering.pass_sizes(spp, pixels)
+    sizes = plan.pass_sizes(spp, pixels)
     assert sum(sizes) == spp
     assert min(sizes) >= 1
-    assert max(sizes) * pixels <= max(rendering.MAX_SAMPLES_PER_PASS, pixels)
+    assert max(sizes) * pixels <= max(plan.MAX_SAMPLES_PER_PASS, pixels)
     assert len(set(sizes[:-1])) <= 1
 
 
 def test_seeds_of_passes_differ_and_the_first_is_the_seed():
-    seeds = [rendering.pass_seed(seed, index) for seed in range(20) for index in range(20)]
+    seeds = [plan.pass_seed(seed, index) for seed in range(20) for index in range(20)]
     assert len(set(seeds)) == 400
-    assert rendering.pass_seed(7, 0) == 7
+    assert plan.pass_seed(7, 0) == 7
 
 
 def test_passes_give_the_mean_of_their_samples(llvm, monkeypatch):
     """Five passes are the mean of five renders, weighted by samples, in all channels."""
-    monkeypatch.setattr(rendering, "SINGLE_PASS_SAMPLES", 0)
+    monkeypatch.setattr(plan, "SINGLE_PASS_SAMPLES", 0)
     loaded = loading.load(str(SCENES / "aov.xml"), {"resx": "24", "resy": "16"})
     fractions = []
-    together = np.array(rendering.render(loaded, 0, 18, 3, fractions.append))
-    sizes = rendering.pass_sizes(18, 24 * 16)
+    together = np.array(rendering.render(Job.of(loaded, 0, 18, 3), fractions.append))
+    sizes = plan.pass_sizes(18, 24 * 16)
     assert fractions == pytest.approx(np.cumsum(sizes) / 18)
     expected = 0.0
     for index, size in enumerate(sizes):
-        seed = rendering.pass_seed(3, index)
+        seed = plan.pass_seed(3, index)
         mi.render(loaded.scene, seed=seed, spp=size)
         image = loaded.scene.sensors()[0].film().bitmap()
         expected = expected + np.array(image) * size / 18

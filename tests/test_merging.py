@@ -4,7 +4,8 @@ import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import loading, merging
+from manylights import loading
+from manylights.loading import merging
 
 from tests import light_scenes
 from tests import statistics_tools as tools

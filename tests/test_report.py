@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +16,19 @@ import pytest
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from manylights.bench import metrics
+from manylights.bench import metrics, records
 from manylights.errors import UsageError
-from manylights.report import charts, grouping, page, pictures, results, sheets, statistics, tables
+from manylights.report import (
+    charts,
+    grouping,
+    markdown,
+    page,
+    pictures,
+    sheets,
+    statistics,
+    tables,
+)
+from manylights.report.text import number
 
 from tests import browser, report_data
 from tests.test_cli import assert_fails, manylights
@@ -39,7 +51,7 @@ def text(folder):
 
 @pytest.fixture
 def data(folder):
-    return results.load(folder)
+    return records.load(folder)
 
 
 @pytest.fixture
@@ -100,15 +112,15 @@ def series_of(points, method="talk", **parameters):
     for spp, seconds, error in points:
         spread = np.array([0.99, 1.0, 1.01])
         errors = error * spread
-        made.append(results.Point(spp, seconds * np.ones(3), np.ones(3), errors, errors, spread))
-    return results.Series(method, method, parameters, 0.0, 0.0, None, made)
+        made.append(records.Point(spp, seconds * np.ones(3), np.ones(3), errors, errors, spread))
+    return records.Series(method, method, parameters, 0.0, 0.0, None, made)
 
 
 def scene_of(*series, error=0.0, mean=1.0, mean_error=0.0):
     reference = {"error": error, "mean": mean, "mean_error": mean_error}
-    fields = {name: None for name in results.SCENE}
+    fields = {field.name: None for field in dataclasses.fields(records.Scene)}
     fields.update(reference=reference, series=list(series), width=10, height=10, lights=1)
-    return results.Scene(None, **fields)
+    return records.Scene(**fields)
 
 
 def test_gain_is_the_ratio_of_error_times_time():
@@ -245,6 +257,62 @@ def test_charts_have_stable_names(folder):
         assert {f"{stem}.svg", f"{stem}.png"} <= names
 
 
+def test_readme_has_the_tables(folder):
+    """Beside the results, with the charts that there are, and without what is private."""
+    readme = (folder / "README.md").read_text()
+    charts = re.findall(r"!\[[^\]]+\]\((\S+)\)", readme)
+    assert charts == ["charts/overview.svg", "charts/lights_city.svg", "charts/boundary_step.svg"]
+    assert all((folder / chart).is_file() for chart in charts)
+    assert "private/works.xml" not in readme
+    data = records.load(folder)
+    for scene in data.scenes:
+        (row,) = re.findall(rf"^\| {re.escape(scene.title)} \| [\d,]+ \| .*, .* \|$", readme, re.M)
+        gains = dict(zip(readme_methods(readme), row.strip("| ").split(" | ")[3:]))
+        for peer in grouping.one_a_method(scene)[1:]:
+            ratio = statistics.gain(peer, grouping.ours(scene), scene)
+            assert gains[peer.method] == number(ratio.value)
+
+
+def readme_methods(readme):
+    """The methods in the heading of the first table."""
+    return re.findall(r"`(\w+)`", next(line for line in readme.splitlines() if "| scene" in line))
+
+
+def test_readme_of_the_repository_is_what_the_command_writes():
+    """Nobody has edited it, and nobody has forgotten to write it again."""
+    committed = Path(__file__).parents[1] / "scenes" / "bench"
+    text = markdown.render(records.load(committed), committed / "charts")
+    assert (committed / "README.md").read_text() == text
+    assert "](more.md)" in text
+
+
+def test_a_readme_by_hand_stays(small, undrawn):
+    path = small()
+    (path / "README.md").write_text("Measured on a rainy day.\n")
+    _, remarks = page.write_report(path, None, publish=False)
+    assert any("README.md: not written by this command" in remark for remark in remarks)
+    assert (path / "README.md").read_text() == "Measured on a rainy day.\n"
+    (path / "README.md").unlink()
+    for _ in range(2):
+        _, remarks = page.write_report(path, None, publish=False)
+        assert not any("README.md" in remark for remark in remarks)
+    assert (path / "README.md").read_text().startswith("# Measurements")
+
+
+def test_readme_of_few_results(small, undrawn):
+    """One scene of one method, and no scene."""
+
+    def one(data):
+        data["scenes"][0]["series"] = data["scenes"][0]["series"][2:]
+
+    for change in (one, lambda data: data["scenes"].clear()):
+        data = records.load(small(change))
+        text = markdown.render(data, data.folder / "charts")
+        assert text.startswith("# Measurements") and "Time to the same error" not in text
+        for scene in list(data.folder.glob("room")):
+            shutil.rmtree(scene)
+
+
 def test_page_needs_no_other_file(text):
     addresses = re.findall(r"""(?:src|href|action|data)=["']([^"']*)""", text)
     assert len(addresses) > 50
@@ -269,12 +337,12 @@ def test_losses_are_on_the_page(text):
 
 
 def test_without_losses_the_page_says_so(small, undrawn):
-    text, _ = page.render(results.load(small()), publish=False)
+    text, _ = page.render(records.load(small()), publish=False)
     assert "In none of 2 comparisons" in text
 
 
 def test_private_pictures_stay_out_of_what_is_published(small, undrawn):
-    data = results.load(small(private=True, source="secret/room.xml"))
+    data = records.load(small(private=True, source="secret/room.xml"))
     text, _ = page.render(data, publish=False)
     sheet = data.folder / "charts" / "pictures_room.svg"
     assert sheet.exists()
@@ -289,7 +357,7 @@ def test_private_scenes_need_no_pictures_to_be_published(small, undrawn):
     path = small(private=True)
     for image in (path / "room").iterdir():
         image.unlink()
-    text, _ = page.render(results.load(path), publish=True)
+    text, _ = page.render(records.load(path), publish=True)
     assert '<th scope="row">Room</th>' in text
 
 
@@ -297,7 +365,7 @@ def test_titles_are_escaped(small, undrawn):
     def change(data):
         data["scenes"][0]["title"] = "<b>A & B</b>"
 
-    text, _ = page.render(results.load(small(change)), publish=False)
+    text, _ = page.render(records.load(small(change)), publish=False)
     assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in text and "<b>A &" not in text
 
 
@@ -308,7 +376,7 @@ def test_few_seeds(small, seeds):
             for name in ("seconds", "cpu_seconds", "error", "error_trimmed", "mean"):
                 point[name] = point[name][:seeds]
 
-    text, _ = page.render(results.load(small(change)), publish=False)
+    text, _ = page.render(records.load(small(change)), publish=False)
     assert ("one seed" in text) is (seeds == 1)
 
 
@@ -318,7 +386,7 @@ def test_only_one_method_and_one_point(small):
         scene["series"] = scene["series"][:1]
         scene["series"][0].update(equal_time=None, points=scene["series"][0]["points"][:1])
 
-    text, _ = page.render(results.load(small(change)), publish=False)
+    text, _ = page.render(records.load(small(change)), publish=False)
     assert "nothing to compare" in text
 
 
@@ -332,7 +400,7 @@ def test_an_interrupted_run_is_shown_as_far_as_it_came(small, undrawn):
                 values.clear()
         data["scenes"].append({**scene, "name": "next", "reference": None, "series": []})
 
-    data = results.load(small(change))
+    data = records.load(small(change))
     assert [[series.spec for series in scene.series] for scene in data.scenes] == [
         ["talk", "resampled_tree"]
     ]
@@ -343,14 +411,14 @@ def test_an_interrupted_run_is_shown_as_far_as_it_came(small, undrawn):
 
 
 def test_no_scenes(small):
-    text, _ = page.render(results.load(small(lambda data: data["scenes"].clear())), publish=False)
+    text, _ = page.render(records.load(small(lambda data: data["scenes"].clear())), publish=False)
     assert "0 scenes" in text
 
 
 def test_missing_maps_are_left_out_with_a_remark(small, undrawn):
     path = small()
     (path / "room" / "talk.maps.exr").unlink()
-    text, remarks = page.render(results.load(path), publish=False)
+    text, remarks = page.render(records.load(path), publish=False)
     assert any("talk.maps.exr" in remark for remark in remarks)
     assert "talk.maps.exr" in text and "resampled_tree.maps.exr" not in text
 
@@ -358,14 +426,14 @@ def test_missing_maps_are_left_out_with_a_remark(small, undrawn):
 def test_maps_without_channels_are_told(small, undrawn):
     path = small()
     report_data.write_exr(path / "room" / "talk.maps.exr", np.ones((45, 80, 3)))
-    _, remarks = page.render(results.load(path), publish=False)
+    _, remarks = page.render(records.load(path), publish=False)
     assert remarks == ["room/talk.maps.exr: has no channel candidates, node_visits"]
 
 
 def test_missing_variance_is_left_out_with_a_remark(small):
     path = small(boundary=True)
     (path / "room" / "talk.variance.exr").unlink()
-    _, remarks = page.render(results.load(path), publish=False)
+    _, remarks = page.render(records.load(path), publish=False)
     assert any("talk.variance.exr" in remark for remark in remarks)
     assert (path / "charts" / "boundary_room.svg").exists()
 
@@ -430,7 +498,7 @@ def repeat_scene(data):
 def test_wrong_results_are_refused(small, change, words):
     path = small(change)
     with pytest.raises(UsageError, match=words) as raised:
-        results.load(path)
+        records.load(path)
     assert "results.json" in str(raised.value)
 
 
@@ -446,15 +514,15 @@ def test_missing_images_are_refused(small, name):
 def test_broken_image_is_refused(small):
     path = small()
     (path / "room" / "talk.exr").write_bytes(b"no image")
-    with pytest.raises(UsageError, match=r"talk\.exr: not readable"):
-        page.render(results.load(path), publish=False)
+    with pytest.raises(UsageError, match=r"talk\.exr: not a readable image"):
+        page.render(records.load(path), publish=False)
 
 
 def test_image_of_another_size_is_refused(small):
     path = small()
     report_data.write_exr(path / "room" / "talk.exr", np.ones((4, 6, 3)))
     with pytest.raises(UsageError, match=r"talk\.exr: 6 x 4 pixels instead of 80 x 45"):
-        page.render(results.load(path), publish=False)
+        page.render(records.load(path), publish=False)
 
 
 def test_page_that_cannot_be_written(folder, tmp_path):
@@ -464,7 +532,7 @@ def test_page_that_cannot_be_written(folder, tmp_path):
 
 def test_importing_the_package_needs_none_of_it():
     names = "{'jinja2', 'matplotlib', 'scipy'}"
-    code = "import sys, manylights.cli; manylights.cli._parser()"
+    code = "import sys; from manylights.cli.main import parser; parser()"
     code += f"; sys.exit(len({names} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 

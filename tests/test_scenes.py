@@ -7,7 +7,8 @@ import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import loading, scenes, tree
+from manylights import loading, scenes
+from manylights.lights import count_kinds
 from manylights.scenes import _build
 
 from tests.conftest import require_variant
@@ -31,7 +32,7 @@ def scalar():
 
 
 def light_count(description):
-    return sum(tree.count_kinds(mi.load_dict(description)).values())
+    return sum(count_kinds(mi.load_dict(description)).values())
 
 
 def fingerprint(value):
@@ -255,4 +256,4 @@ def test_files_load_and_have_the_lights_of_the_readme(each_variant, path):
         pytest.skip("Mitsuba has no sky in monochromatic variants")
     # Any integrator does: what counts here is that the variant accepts the scene's contents.
     scene = loading.load(str(path), {"spp": "1"}, integrator="path").scene
-    assert sum(tree.count_kinds(scene).values()) == readme_rows()[path.name]
+    assert sum(count_kinds(scene).values()) == readme_rows()[path.name]

@@ -16,6 +16,17 @@ path for the whole process and reads it whenever a scene asks for a plugin.
 scenes; ``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose emitters by
 power, for comparisons. ``manylights.merge_emitters(description)`` makes scenes with thousands of
 separate lamps start in seconds.
+
+What is where, each using only those before it:
+
+- ``errors``, ``files``, ``threads``, ``progress``: what all parts of the command need;
+- ``output``: images and the channels of their files;
+- ``scenes``: generators of scenes;
+- ``loading``: from a file to Mitsuba's scene, with our integrator; ``usd``: the reader of USD;
+- ``power``, ``lights``: power of emitters; numbers about the lights of a scene and their tree;
+- ``rendering``: a job in passes, with checkpoints;
+- ``bench``, ``report``: measures methods, and makes pages of what was measured;
+- ``cli``: the command ``manylights``, a file for each of its commands.
 """
 
 from __future__ import annotations
@@ -26,7 +37,7 @@ register()
 
 # These need the right Mitsuba, which register() checks.
 from manylights import scenes  # noqa: E402
-from manylights.merging import merge_emitters  # noqa: E402
+from manylights.loading.merging import merge_emitters  # noqa: E402
 from manylights.power import power_sampling, power_weights  # noqa: E402
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""The command ``manylights compare``: how much two images differ, as numbers and as a picture."""
+"""How much two images differ, as numbers and as a picture."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights import images
 from manylights.bench import metrics
-from manylights.errors import UsageError, one_line
-from manylights.threads import threads_for_files
+from manylights.errors import UsageError
+from manylights.output import images
 
 #: Exit status for images that differ.
 DIFFERENT = 1
@@ -22,35 +21,6 @@ LARGEST_ERROR = 1e-6
 
 #: Without --threshold, with a reference: how many times the error of B that of A may be.
 LARGEST_RATIO = 1.1
-
-
-def read_image(path: str, prefix: str = "") -> np.ndarray:
-    """Return the colours of an image file, linear, shape (height, width, 3), single precision.
-
-    Args:
-        path: a file of a format that Mitsuba reads.
-        prefix: what to write before the file's name in messages.
-
-    Raises:
-        UsageError: no such file, not an image, no colours, or pixels that are not finite.
-    """
-    if not Path(path).is_file():
-        raise UsageError(f"{prefix}{path}: no such file")
-    try:
-        with threads_for_files():
-            bitmap = mi.Bitmap(path)
-    except RuntimeError as error:
-        raise UsageError(f"{prefix}{path}: not a readable image ({one_line(error)})") from error
-    formats = mi.Bitmap.PixelFormat
-    if bitmap.pixel_format() == formats.MultiChannel:
-        bitmap = dict(bitmap.split()).get("<root>", bitmap)
-    if bitmap.pixel_format() == formats.MultiChannel:
-        raise UsageError(f"{prefix}{path}: has no colour channels (R, G, B or Y)")
-    image = np.array(bitmap.convert(formats.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
-    broken = int(np.sum(~np.isfinite(image).all(axis=2)))
-    if broken:
-        raise UsageError(f"{prefix}{path}: {broken} pixels are infinite or not a number")
-    return image
 
 
 def check_size(image: np.ndarray, name: str, first: np.ndarray, first_name: str) -> None:

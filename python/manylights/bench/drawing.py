@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from manylights import rendering
-from manylights.bench.scene_source import LoadedScene
+from manylights.bench.scene_source import MeasuredScene
 from manylights.errors import UsageError
+from manylights.rendering import plan as plans
 
 #: Channels of a pixel that are colours, by the number of channels: with or without alpha.
 COLORS = {1: 1, 2: 1, 3: 3, 4: 3}
@@ -29,7 +29,7 @@ class Drawing:
     cpu_seconds: float
 
 
-def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
+def draw(loaded: MeasuredScene, integrator, spp: int, seed: int) -> Drawing:
     """Render a scene and measure how long that takes, until the pixels are in memory.
 
     Args:
@@ -53,7 +53,7 @@ def draw(loaded: LoadedScene, integrator, spp: int, seed: int) -> Drawing:
 
 
 def draw_channels(
-    loaded: LoadedScene, integrator, spp: int, seed: int, names: list[str]
+    loaded: MeasuredScene, integrator, spp: int, seed: int, names: tuple[str, ...]
 ) -> np.ndarray:
     """Render a scene and return those channels that the integrator adds under these names."""
     pixels = np.array(integrator.render(loaded.scene, sensor=0, seed=seed, spp=spp))
@@ -61,20 +61,17 @@ def draw_channels(
     return pixels[..., [added.index(name) - len(added) for name in names]]
 
 
-def _render(loaded: LoadedScene, integrator, spp: int, seed: int) -> np.ndarray:
+def _render(loaded: MeasuredScene, integrator, spp: int, seed: int) -> np.ndarray:
     """Render in as many passes as the memory needs; each sample has the same weight."""
     width, height = loaded.size
-    sizes = [spp]
-    if (
-        not mi.variant().startswith("scalar")
-        and spp * width * height > rendering.MAX_SAMPLES_PER_PASS
-    ):
-        sizes = rendering.pass_sizes(spp, width * height)
+    plan = plans.whole(spp, seed)
+    many = spp * width * height > plans.MAX_SAMPLES_PER_PASS
+    if many and not mi.variant().startswith("scalar"):
+        plan = plans.split(spp, width * height, seed, scalar=False)
     total = 0.0
-    for index, size in enumerate(sizes):
-        seed_of_pass = rendering.pass_seed(seed, index)
-        pixels = integrator.render(loaded.scene, sensor=0, seed=seed_of_pass, spp=size)
-        total = total + np.array(pixels) * (size / spp)
+    for part in plan.passes:
+        pixels = integrator.render(loaded.scene, sensor=0, seed=part.seed, spp=part.spp)
+        total = total + np.array(pixels) * (part.spp / spp)
     return total
 
 

@@ -14,21 +14,71 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights import integrators
 from manylights.errors import UsageError, one_line
+from manylights.loading import integrators
 
-#: Names of methods: Mitsuba's integrators, and values of our parameter ``method``.
-MITSUBAS = ("uniform", "power")
-OURS = ("resampled_tree", "talk", "adaptive_splitting", "tree", "exhaustive")
+
+@dataclass(frozen=True)
+class About:
+    """What is told about a method.
+
+    Attributes:
+        meaning: for readers of a report.
+        color: of its lines, one that colour-blind readers tell apart (Okabe and Ito 2008).
+        marker: of its points, as matplotlib names it.
+    """
+
+    meaning: str
+    color: str
+    marker: str
+
+
+#: All methods, in the order of charts. A new one of ours is added to ``integrators.METHODS``, too.
+ABOUT = {
+    "resampled_tree": About(
+        "ours with its default settings: equidistant points descend the tree, the lights they "
+        "find are resampled",
+        "#D55E00",
+        "o",
+    ),
+    "talk": About(
+        "the algorithm of the talk as published: stochastic splitting of a binary tree",
+        "#0072B2",
+        "s",
+    ),
+    "adaptive_splitting": About(
+        "deterministic splitting: a node is split where it looks large, so neighbouring pixels "
+        "can have different cuts of the tree",
+        "#009E73",
+        "^",
+    ),
+    "tree": About("one light by a random descent of the tree", "#CC79A7", "D"),
+    "exhaustive": About("every light at every point", "#000000", "X"),
+    "uniform": About("Mitsuba's own integrator, emitters chosen uniformly", "#56B4E9", "v"),
+    "power": About(
+        "Mitsuba's own integrator, emitters chosen in proportion to their power", "#E69F00", "P"
+    ),
+}
+
+#: Names of methods: values of our parameter ``method``, and Mitsuba's integrators.
+OURS = integrators.METHODS
+MITSUBAS = tuple(name for name in ABOUT if name not in OURS)
 NAMES = (*MITSUBAS, *OURS)
+
+#: Parameters that sweeps are made of.
+SWEPT = {
+    name: parameter
+    for name, parameter in integrators.SAMPLING_PARAMETERS.items()
+    if parameter.symbol
+}
 
 #: More lights would take hours with ``exhaustive``, which evaluates them all at every point.
 EXHAUSTIVE_LIGHTS = 10_000
 
 #: Parameters that a method may have: what makes up the method, not what is measured about it.
 PARAMETERS = {
-    name: meaning
-    for name, meaning in integrators.SAMPLING_PARAMETERS.items()
+    name: parameter
+    for name, parameter in integrators.SAMPLING_PARAMETERS.items()
     if name not in ("method", "counts")
 }
 
@@ -48,7 +98,9 @@ class Method:
     @property
     def spec(self) -> str:
         """The method as text, always the same for the same method."""
-        return ":".join([self.name, *(f"{k}={_text(v)}" for k, v in self.parameters.items())])
+        return ":".join(
+            [self.name, *(f"{k}={integrators.value_text(v)}" for k, v in self.parameters.items())]
+        )
 
     @property
     def key(self) -> str:
@@ -159,13 +211,7 @@ def _value(name: str, text: str) -> Any:
         # As text, which the plugins read, since JSON has no infinity.
         return "inf"
     is_number = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if is_number and PARAMETERS[name].startswith("float") else value
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return float(value) if is_number and PARAMETERS[name].allowed.startswith("float") else value
 
 
 def _listed(names) -> str:

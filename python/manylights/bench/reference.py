@@ -16,11 +16,11 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.bench import methods, metrics
-from manylights.bench.compare import read_image
 from manylights.bench.drawing import draw
 from manylights.bench.moments import Moments
-from manylights.bench.scene_source import LoadedScene
+from manylights.bench.scene_source import MeasuredScene
 from manylights.errors import UsageError
+from manylights.output import channels
 
 #: Samples of the reference for each sample of the largest measurement, and independent renders of
 #: that many samples which its own error is taken from.
@@ -31,7 +31,7 @@ FIRST_SEED = 2**31
 
 
 def render(
-    loaded: LoadedScene, spp: int, advance: Callable[[float], None]
+    loaded: MeasuredScene, spp: int, advance: Callable[[float], None]
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Render a reference of ``PASSES`` times ``spp`` samples.
 
@@ -75,7 +75,7 @@ def read(path: str, size: tuple[int, int]) -> tuple[np.ndarray, dict[str, Any]]:
     Raises:
         UsageError: not readable, of another size, or with pixels that are not numbers.
     """
-    image = read_image(path, "--reference ")
+    image = channels.read_colors(path, "--reference ")
     height, width = image.shape[:2]
     if (width, height) != size:
         raise UsageError(

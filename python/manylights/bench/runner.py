@@ -18,14 +18,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights.bench import calibration, metrics, reference
+from manylights.bench import calibration, metrics, records, reference
 from manylights.bench.drawing import BrokenImage, Drawing, draw, draw_channels
+from manylights.bench.folder import Folder, is_skipped, series_of, skip, unskip
 from manylights.bench.methods import EXHAUSTIVE_LIGHTS, Method, integrator_for
 from manylights.bench.moments import Moments
-from manylights.bench.results import Results, is_skipped, series_of, skip, unskip
-from manylights.bench.scene_source import LoadedScene, Source
+from manylights.bench.scene_source import MeasuredScene, Source
 from manylights.bench.workload import Workload
 from manylights.errors import UsageError, one_line
+from manylights.output import channels
 from manylights.power import power_sampling, power_weights
 from manylights.progress import say
 
@@ -48,11 +49,9 @@ MAP_SAMPLES = 4
 #: measured the time left is guessed with them.
 GUESSED_SHARE, GUESSED_ENDING = 0.8, 4.0
 
-RGB = ["R", "G", "B"]
-
 
 @dataclass
-class Job:
+class Task:
     """A scene to measure.
 
     Attributes:
@@ -105,24 +104,24 @@ class Candidate:
 
 
 def run(
-    jobs: list[Job], settings: Settings, found: Results, report: Callable[[float], None]
+    tasks: list[Task], settings: Settings, found: Folder, report: Callable[[float], None]
 ) -> None:
     """Measure all scenes and write the results.
 
     Args:
-        jobs: the scenes.
+        tasks: the scenes.
         settings: what is rendered.
         found: earlier results, to which those of this run are added.
         report: called with the finished fraction, from 0 to 1.
     """
-    work = Workload({job.source.text: _guess(job, settings) for job in jobs}, report)
-    for job in jobs:
-        entry = found.find(job.source)
-        if entry is not None and _is_finished(entry, job.methods, settings):
+    work = Workload({task.source.text: _guess(task, settings) for task in tasks}, report)
+    for task in tasks:
+        entry = found.find(task.source)
+        if entry is not None and _is_finished(entry, task.methods, settings):
             say(f"{entry['name']}: nothing to do")
-            work.expect(job.source.text, 0.0)
+            work.expect(task.source.text, 0.0)
             continue
-        SceneRun(job, settings, found, work).run()
+        SceneRun(task, settings, found, work).run()
         # Virtual calls of later scenes would include the emitters of this one; and kernels in
         # memory would make later first renders quick.
         gc.collect()
@@ -133,9 +132,9 @@ def run(
 class SceneRun:
     """The measurement of one scene."""
 
-    def __init__(self, job: Job, settings: Settings, found: Results, work: Workload) -> None:
-        self.job, self.settings, self.found, self.work = job, settings, found, work
-        self.loaded: LoadedScene = job.source.load()
+    def __init__(self, task: Task, settings: Settings, found: Folder, work: Workload) -> None:
+        self.task, self.settings, self.found, self.work = task, settings, found, work
+        self.loaded: MeasuredScene = task.source.load()
         self.entry = self._entry()
         self.weights = power_weights(self.loaded.scene)
         self.reference = np.zeros(0)
@@ -145,7 +144,7 @@ class SceneRun:
     def run(self) -> None:
         """Do everything that is missing."""
         self.entry.pop("finished", None)
-        for method in self.job.methods:
+        for method in self.task.methods:
             unskip(self.entry, method)
         say(f"{self.entry['name']}: {self.entry['lights']:,} lights")
         # First, since it finds unreadable files.
@@ -160,23 +159,23 @@ class SceneRun:
             self._write_variance(candidate)
         self.entry["finished"] = True
         self.found.save()
-        self.work.expect(self.job.source.text, 0.0)
+        self.work.expect(self.task.source.text, 0.0)
 
     def _entry(self) -> dict[str, Any]:
-        job, loaded = self.job, self.loaded
+        task, loaded = self.task, self.loaded
         width, height = loaded.size
         return self.found.scene(
-            job.source,
-            name=job.name or job.source.name,
-            title=job.title or job.source.text,
-            family=job.family or job.source.family,
+            task.source,
+            name=task.name or task.source.name,
+            title=task.title or task.source.text,
+            family=task.family or task.source.family,
             lights=loaded.lights,
             width=width,
             height=height,
             max_depth=loaded.kind.max_depth,
             media=loaded.media,
-            private=job.private,
-            boundary=job.boundary,
+            private=task.private,
+            boundary=task.boundary,
             equal_time=self.settings.budget,
         )
 
@@ -199,7 +198,7 @@ class SceneRun:
             drawing = draw(self.loaded, candidate.integrator, spp, seed)
         # Mitsuba tells environments about each change, which makes them look new to our trees.
         if scene.environment() is not None:
-            self.stale = {method.spec for method in self.job.methods if method.is_ours}
+            self.stale = {method.spec for method in self.task.methods if method.is_ours}
         return drawing
 
     def _attempt(self, candidate: Candidate, step: Callable[[Candidate], Any]) -> bool:
@@ -219,14 +218,16 @@ class SceneRun:
 
     def _calibrate_all(self) -> list[Candidate]:
         candidates = []
-        for method in self.job.methods:
+        for method in self.task.methods:
             why = self._impossible(method)
             if why:
                 self._skip(method, why)
             else:
-                integrator = mi.load_dict(integrator_for(method, self.loaded.kind))
-                series = series_of(self.entry, method) or _new_series(method, self.loaded)
-                candidate = Candidate(method, integrator, series, {})
+                description = integrator_for(method, self.loaded.kind)
+                series = series_of(self.entry, method) or records.new_series(
+                    method.spec, method.name, method.parameters, description
+                )
+                candidate = Candidate(method, mi.load_dict(description), series, {})
                 if self._attempt(candidate, self._calibrate) and candidate.times:
                     candidates.append(candidate)
         return candidates
@@ -266,7 +267,7 @@ class SceneRun:
             series["build_seconds"] = _build_seconds(candidate)
         missing = [spp for spp in wanted if spp not in candidate.spps]
         series["points"] = sorted(
-            [*series["points"], *map(_new_point, missing)], key=lambda point: point["spp"]
+            [*series["points"], *map(records.new_point, missing)], key=lambda point: point["spp"]
         )
 
     def _largest(self) -> int | None:
@@ -289,7 +290,7 @@ class SceneRun:
         seconds += 3.0 * self.settings.budget * len(candidates)
         if self.entry["reference"] is None and candidates:
             seconds += reference.PASSES * max(c.times[max(c.times)] for c in candidates)
-        self.work.expect(self.job.source.text, seconds)
+        self.work.expect(self.task.source.text, seconds)
 
     def _group_seconds(self, candidate: Candidate) -> float:
         return sum(calibration.predict(candidate.times, spp) for spp in candidate.spps)
@@ -298,9 +299,9 @@ class SceneRun:
 
     def _given_reference(self) -> None:
         name = self.entry["name"]
-        if self.job.reference is not None:
-            image, facts = reference.read(self.job.reference, self.loaded.size)
-            self.found.write_image(name, "reference", image, RGB)
+        if self.task.reference is not None:
+            image, facts = reference.read(self.task.reference, self.loaded.size)
+            self.found.write_image(name, "reference", image, channels.RGB)
             self.reference, self.entry["reference"] = image, facts
         elif self.entry["reference"] is not None and self.found.has_image(name, "reference"):
             self.reference = self.found.read_reference(name)
@@ -309,14 +310,14 @@ class SceneRun:
         if self.reference.size or not candidates:
             return
         spp = self._largest() or max(max(candidate.spps) for candidate in candidates)
-        name, part = self.entry["name"], self.job.source.text
+        name, part = self.entry["name"], self.task.source.text
         try:
             image, facts = reference.render(
                 self.loaded, spp, lambda seconds: self.work.finish(part, seconds)
             )
         except BrokenImage as error:
             raise UsageError(f"{name}: the reference failed: {error}") from error
-        self.found.write_image(name, "reference", image, RGB)
+        self.found.write_image(name, "reference", image, channels.RGB)
         self.reference, self.entry["reference"] = image, facts
         self.found.save()
         say(
@@ -331,7 +332,7 @@ class SceneRun:
             for candidate in list(candidates):
                 if not self._attempt(candidate, lambda c, seed=seed: self._measure(c, seed)):
                     candidates.remove(candidate)
-                self.work.finish(self.job.source.text, self._group_seconds(candidate))
+                self.work.finish(self.task.source.text, self._group_seconds(candidate))
 
     def _measure(self, candidate: Candidate, seed: int) -> None:
         """Render all numbers of samples with one seed, then write the results."""
@@ -375,7 +376,7 @@ class SceneRun:
         if len(moments.seeds) > 1:
             variance = moments.variance() * max(candidate.spps)
             name = f"{candidate.method.key}.variance"
-            self.found.write_image(self.entry["name"], name, variance, RGB)
+            self.found.write_image(self.entry["name"], name, variance, channels.RGB)
 
     # -- at the end
 
@@ -398,9 +399,11 @@ class SceneRun:
             "error_trimmed": metrics.trimmed_mean(errors),
             "flip": metrics.flip_error(drawing.image, self.reference),
         }
-        self.found.write_image(self.entry["name"], candidate.method.key, drawing.image, RGB)
+        self.found.write_image(
+            self.entry["name"], candidate.method.key, drawing.image, channels.RGB
+        )
         self.found.save()
-        self.work.finish(self.job.source.text, 3.0 * target)
+        self.work.finish(self.task.source.text, 3.0 * target)
 
     def _fill_time(self, candidate: Candidate, target: float) -> tuple[int, Drawing]:
         """Render until a number of samples takes about ``target`` seconds; return the best."""
@@ -423,27 +426,8 @@ class SceneRun:
             return
         description = integrator_for(candidate.method, self.loaded.kind)
         counting = mi.load_dict({**description, "counts": True})
-        channels = ["candidates", "node_visits"]
-        maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, channels)
-        self.found.write_image(self.entry["name"], name, maps, channels)
-
-
-def _new_series(method: Method, loaded: LoadedScene) -> dict[str, Any]:
-    return {
-        "spec": method.spec,
-        "method": method.name,
-        "parameters": method.parameters,
-        "integrator": integrator_for(method, loaded.kind),
-        "build_seconds": 0.0,
-        "first_seconds": 0.0,
-        "equal_time": None,
-        "points": [],
-    }
-
-
-def _new_point(spp: int) -> dict[str, Any]:
-    names = ("seed", "seconds", "cpu_seconds", "error", "error_trimmed", "flip", "mean")
-    return {"spp": spp, **{name: [] for name in names}}
+        maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, channels.WORK)
+        self.found.write_image(self.entry["name"], name, maps, channels.WORK)
 
 
 def _build_seconds(candidate: Candidate) -> float:
@@ -454,9 +438,9 @@ def _build_seconds(candidate: Candidate) -> float:
     return 1e-3 * float(value if isinstance(value, (int, float)) else value[0])
 
 
-def _guess(job: Job, settings: Settings) -> float:
+def _guess(task: Task, settings: Settings) -> float:
     groups = settings.seeds * GUESSED_SHARE + GUESSED_ENDING
-    return settings.budget * (len(job.methods) * groups + GUESSED_SHARE * reference.PASSES)
+    return settings.budget * (len(task.methods) * groups + GUESSED_SHARE * reference.PASSES)
 
 
 def _is_finished(entry: dict[str, Any], methods: list[Method], settings: Settings) -> bool:

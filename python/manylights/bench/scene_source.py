@@ -1,4 +1,6 @@
-"""What SCENE may be on the command line: an XML file, or a generator of ``manylights.scenes``.
+"""What SCENE may be on the command line: a file, or a generator of ``manylights.scenes``.
+
+A file is XML of Mitsuba, or a USD stage.
 
 A generator is written ``NAME[:LIGHTS][,KEY=VALUE]...``, as in ``city:1000,kind=points``. The keys
 are the arguments of the generator, and ``integrator``, ``max_depth``, ``rr_depth`` and
@@ -23,9 +25,11 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights import integrators, loading, scenes, tree
+from manylights import lights, loading, scenes
 from manylights.bench import methods
 from manylights.errors import UsageError, one_line
+from manylights.loading import integrators
+from manylights.loading.parsing import USD_ENDINGS
 from manylights.threads import threads_for_files
 
 WIDTH, HEIGHT = 160, 90
@@ -38,7 +42,7 @@ TEXTURED = ("city", "fog_open", "fog_rooms", "fog_street", "glossy", "rooms")
 
 
 @dataclass
-class LoadedScene:
+class MeasuredScene:
     """A scene in memory and what is to be known about it.
 
     Attributes:
@@ -76,24 +80,25 @@ class Source:
     name: str
     family: str
     fingerprint: str
-    load: Callable[[], LoadedScene]
+    load: Callable[[], MeasuredScene]
 
 
 def find(text: str, defines: dict[str, str] | None = None) -> Source:
     """Find the scene that ``text`` names, and check what can be checked without loading it.
 
     Args:
-        text: an XML file or a call of a generator.
+        text: a scene file or a call of a generator.
         defines: values for the ``<default>`` parameters of XML files. Default: none.
 
     Raises:
         UsageError: there is no such file or generator, or it does not accept its arguments.
     """
-    if Path(text).suffix == ".xml" or Path(text).is_file():
+    if Path(text).suffix.lower() in (".xml", *USD_ENDINGS) or Path(text).is_file():
         return _file(text, defines or {})
     if _parse_call(text)[0] not in scenes.names():
         raise UsageError(
-            f"{text}: neither an XML file nor a generator, those are {', '.join(scenes.names())}"
+            f"{text}: neither an XML file nor a USD stage nor a generator, those are "
+            f"{', '.join(scenes.names())}"
         )
     return _generated(text)
 
@@ -101,8 +106,7 @@ def find(text: str, defines: dict[str, str] | None = None) -> Source:
 def _file(path: str, defines: dict[str, str]) -> Source:
     try:
         with loading.search_beside(path), threads_for_files():
-            _, state = loading.parse(path, defines)
-            files = loading.files_of(state)
+            files = loading.parse(path, defines).files
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
@@ -112,7 +116,7 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     for file in files:
         digest.update(file.read_bytes())
 
-    def load() -> LoadedScene:
+    def load() -> MeasuredScene:
         try:
             return _load_file(path, defines)
         except RuntimeError as error:
@@ -123,27 +127,26 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     return Source(text, name, name, digest.hexdigest(), load)
 
 
-def _load_file(path: str, defines: dict[str, str]) -> LoadedScene:
+def _load_file(path: str, defines: dict[str, str]) -> MeasuredScene:
     with loading.search_beside(path), threads_for_files():
-        config, state = loading.parse(path, defines)
+        parsed = loading.parse(path, defines)
         plugin, parameters = "path", {}
-        for node in integrators.leaf_integrators(state):
+        for node in integrators.leaf_integrators(parsed.state):
             plugin, parameters = node.props.plugin_name(), dict(node.props.items())
-        for node in state.nodes:
+        for node in parsed.state.nodes:
             if node.type == mi.ObjectType.Sampler:
                 node.props = mi.Properties("independent")
-        media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
-        scene = loading.instantiate(config, state)
+        media = any(node.type == mi.ObjectType.Medium for node in parsed.state.nodes)
+        scene = loading.instantiate(parsed)
     return _describe(path, scene, plugin, parameters, media)
 
 
 def _generated(text: str) -> Source:
     name, arguments, settings = _parse_call(text)
     # A small one of the same kind: names and values are checked before anything is measured.
-    lights = arguments.get("n_lights", 10)
-    _generate(
-        text, name, {**arguments, "n_lights": lights if lights > 1_000_000 else min(lights, 10)}
-    )
+    count = arguments.get("n_lights", 10)
+    few = count if count > 1_000_000 else min(count, 10)
+    _generate(text, name, {**arguments, "n_lights": few})
     content = json.dumps([name, arguments, settings], sort_keys=True, default=str)
     from manylights import __version__
 
@@ -151,7 +154,7 @@ def _generated(text: str) -> Source:
     rest = [f"{key}={value}" for key, value in (*arguments.items(), *settings.items())]
     rest = [item for item in rest if not item.startswith("n_lights=")]
 
-    def load() -> LoadedScene:
+    def load() -> MeasuredScene:
         description = _generate(text, name, arguments)
         chosen = dict(description["integrator"])
         plugin = settings.get("integrator", chosen.pop("type"))
@@ -167,15 +170,15 @@ def _generated(text: str) -> Source:
 def _parse_call(text: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Split a call into the generator's name, its arguments, and settings of the integrator."""
     head, *items = text.split(",")
-    name, separator, lights = head.partition(":")
-    if separator and "=" in lights:
-        items, lights = [lights, *items], ""
+    name, separator, count = head.partition(":")
+    if separator and "=" in count:
+        items, count = [count, *items], ""
     arguments: dict[str, Any] = {}
     settings: dict[str, Any] = {}
-    if lights:
-        if not lights.isdigit():
-            raise UsageError(f"{text}: {lights!r} is not a number of lights")
-        arguments["n_lights"] = int(lights)
+    if count:
+        if not count.isdigit():
+            raise UsageError(f"{text}: {count!r} is not a number of lights")
+        arguments["n_lights"] = int(count)
     for item in items:
         key, equals, value = item.partition("=")
         if not equals or not key:
@@ -212,13 +215,13 @@ def _quiet():
 
 def _describe(
     text: str, scene, plugin: str, parameters: dict[str, Any], media: bool
-) -> LoadedScene:
+) -> MeasuredScene:
     try:
         kind = methods.kind_of(plugin, parameters, media)
     except UsageError as error:
         raise UsageError(f"{text}: {error}") from error
-    lights = sum(tree.count_kinds(scene).values())
-    return LoadedScene(scene, kind, lights, media)
+    count = sum(lights.count_kinds(scene).values())
+    return MeasuredScene(scene, kind, count, media)
 
 
 def _plain(text: str) -> str:

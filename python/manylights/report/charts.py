@@ -1,7 +1,7 @@
 """Draws the charts with matplotlib, without its global state, and writes them as PNG and SVG.
 
-Colours are those of Okabe and Ito (2008), which colour-blind readers tell apart; each method also
-has a marker of its own. Charts are five inches wide so that their text is legible on a phone.
+Each method has a colour and a marker of its own (``bench.methods.ABOUT``). Charts are five inches
+wide so that their text is legible on a phone.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from manylights.bench.methods import ABOUT, SWEPT
+from manylights.bench.records import Results, Scene, Series
+from manylights.loading.integrators import value_text
 from manylights.report import grouping
-from manylights.report.results import Results, Scene, Series
 from manylights.report.statistics import (
     CLEARLY_ABOVE,
     Interval,
@@ -33,16 +35,7 @@ from manylights.report.statistics import (
     time_to_reach,
 )
 
-#: Colour and marker of each method.
-LOOKS = {
-    "resampled_tree": ("#D55E00", "o"),
-    "talk": ("#0072B2", "s"),
-    "adaptive_splitting": ("#009E73", "^"),
-    "tree": ("#CC79A7", "D"),
-    "exhaustive": ("#000000", "X"),
-    "uniform": ("#56B4E9", "v"),
-    "power": ("#E69F00", "P"),
-}
+#: Colour and marker of a method that is not known.
 OTHER_LOOK = ("#777777", "*")
 #: Tells series of one method apart.
 DASHES = ("-", "--", ":", "-.")
@@ -208,7 +201,7 @@ def _some_limited(scene: Scene) -> bool:
 
 def _error_line(axes, series: Series, scene: Scene, dash: str, label: str) -> Line2D:
     """Draw one series with its band; return what the legend shows."""
-    color, marker = LOOKS.get(series.method, OTHER_LOOK)
+    color, marker = _look(series.method)
     times = np.array([point.seconds.mean() for point in series.points])
     errors = [error_interval(point) for point in series.points]
     limited = np.array([is_limited(point, scene) for point in series.points])
@@ -284,7 +277,7 @@ def _reach(rows: list[tuple]) -> Figure:
         for method, reach in reached.items():
             # Markers of one scene are spread, so that none hides another.
             shift = (methods.index(method) + 0.5) / len(methods) - 0.5
-            color, marker = LOOKS.get(method, OTHER_LOOK)
+            color, marker = _look(method)
             face = color if reach.measured else "white"
             time = reach.seconds
             look = {"color": color, "marker": marker, "linestyle": ""}
@@ -355,13 +348,12 @@ def _lights(scenes: list[Scene]) -> Figure:
 
 
 def _sweeps(results: Results) -> Iterator[tuple]:
-    symbols = {"splitting_rate": "gamma", "reservoirs": "m", "shadow_rays": "s"}
     for scene in results.scenes:
-        for parameter in grouping.SWEPT:
+        for parameter in SWEPT:
             groups = grouping.sweeps(scene, parameter)
             if groups:
-                title = f"{scene.title}: {parameter} ({symbols[parameter]})"
-                values = ", ".join(grouping.value_text(value) for value, _ in groups[0])
+                title = f"{scene.title}: {parameter} ({SWEPT[parameter].symbol})"
+                values = ", ".join(value_text(value) for value, _ in groups[0])
                 alt = f"Error and time against {parameter} ({values}) in {scene.title}."
                 figure = _sweep(scene, parameter, groups)
                 yield f"sweep_{parameter}_{scene.name}", title, alt, figure
@@ -419,7 +411,7 @@ def _boundary(lines: list[tuple[Series, np.ndarray]]) -> Figure:
     figure, axes = _figure()
     used = {}
     for index, (series, line) in enumerate(lines):
-        color, marker = LOOKS.get(series.method, OTHER_LOOK)
+        color, marker = _look(series.method)
         dash = DASHES[used.get(series.method, 0) % len(DASHES)]
         used[series.method] = used.get(series.method, 0) + 1
         axes.plot(
@@ -454,7 +446,7 @@ def _figure(height: float = HEIGHT):
 
 def _curve(axes, method, positions, intervals: list[Interval], label, dash="-") -> Line2D:
     """Draw values with their intervals as a band; return what the legend shows."""
-    color, marker = LOOKS.get(method, OTHER_LOOK)
+    color, marker = _look(method)
     look = {"color": color, "marker": marker, "linestyle": dash, "label": label}
     axes.plot(positions, [one.value for one in intervals], **look, zorder=3)
     lows, highs = ([getattr(one, end) for one in intervals] for end in ("low", "high"))
@@ -462,9 +454,15 @@ def _curve(axes, method, positions, intervals: list[Interval], label, dash="-") 
     return Line2D([], [], **look)
 
 
+def _look(method: str) -> tuple[str, str]:
+    """Return colour and marker of a method."""
+    about = ABOUT.get(method)
+    return (about.color, about.marker) if about else OTHER_LOOK
+
+
 def _ordered(methods) -> list[str]:
     """Sort names of methods: ours first, unknown ones last."""
-    known = [name for name in LOOKS if name in methods]
+    known = [name for name in ABOUT if name in methods]
     return known + sorted(set(methods) - set(known))
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from manylights.report.results import Results, Scene, Series
+from manylights.bench.methods import SWEPT
+from manylights.bench.records import Results, Scene, Series
+from manylights.loading.integrators import value_text
 from manylights.report.statistics import cost
-
-#: Parameters that are swept, with what a series has that does not name them.
-SWEPT = {"splitting_rate": 1.0, "reservoirs": 8, "shadow_rays": 4}
 
 #: A sweep with fewer values is no curve.
 MIN_SWEEP = 3
@@ -17,16 +16,11 @@ MIN_SWEEP = 3
 
 def label(series: Series, without: str = "") -> str:
     """Name a series for people, leaving out the parameter ``without``."""
-    name = {"resampled_tree": "resampled_tree (ours)"}.get(series.method, series.method)
+    name = f"{series.method} (ours)" if series.ours else series.method
     if series.mitsubas:
         name = f"{series.method} (Mitsuba)"
     settings = [f"{key} {value_text(value)}" for key, value in series.parameters.items()]
     return ", ".join([name] + [text for text in settings if text.split()[0] != without])
-
-
-def value_text(value: Any) -> str:
-    """Write the value of a parameter; whole numbers without a point."""
-    return f"{value:g}" if isinstance(value, (int, float)) else str(value)
 
 
 def ours(scene: Scene) -> Series | None:
@@ -85,7 +79,7 @@ def sweeps(scene: Scene, parameter: str) -> list[list[tuple[Any, Series]]]:
     # A series that names the default comes later and replaces the one that does not.
     for series in sorted(scene.series, key=lambda series: len(series.parameters)):
         if not series.mitsubas:
-            value = series.parameters.get(parameter, SWEPT[parameter])
+            value = series.parameters.get(parameter, SWEPT[parameter].default)
             groups[_without(series, (parameter,))][float(value)] = (value, series)
     long = [group for group in groups.values() if len(group) >= MIN_SWEEP]
     return [[group[value] for value in sorted(group)] for group in long]
@@ -109,6 +103,6 @@ def _without(series: Series, names: tuple[str, ...]) -> tuple:
     left = {
         key: str(value)
         for key, value in series.parameters.items()
-        if key not in names and value != SWEPT.get(key)
+        if key not in names and not (key in SWEPT and value == SWEPT[key].default)
     }
     return (series.method, *sorted(left.items()))

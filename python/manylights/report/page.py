@@ -4,35 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jinja2
-import numpy as np
 
 from manylights import files
-from manylights.report import charts, grouping, pictures, results, sheets, statistics, tables
+from manylights.bench import records
+from manylights.bench.methods import ABOUT
+from manylights.report import charts, grouping, markdown, pictures, sheets, statistics, tables
+from manylights.report.text import number, percent, ratio
 
 PAGE_NAME, CHART_FOLDER = "report.html", "charts"
-
-#: What the methods do, for readers of the page.
-METHODS = {
-    "resampled_tree": "ours with its default settings: equidistant points descend the tree, the "
-    "lights they find are resampled",
-    "talk": "the algorithm of the talk as published: stochastic splitting of a binary tree",
-    "adaptive_splitting": "deterministic splitting: a node is split where it looks large, so "
-    "neighbouring pixels can have different cuts of the tree",
-    "tree": "one light by a random descent of the tree",
-    "exhaustive": "every light at every point",
-    "uniform": "Mitsuba's own integrator, emitters chosen uniformly",
-    "power": "Mitsuba's own integrator, emitters chosen in proportion to their power",
-}
 
 
 @dataclass(frozen=True)
 class Steps:
     """Largest step between neighbouring columns of a boundary scene."""
 
-    scene: results.Scene
+    scene: records.Scene
     label: str
     low: float
     high: float
@@ -40,7 +28,7 @@ class Steps:
 
 
 def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, list[str]]:
-    """Write the page and the charts.
+    """Write the page, the charts, and README.md beside the results.
 
     Args:
         folder: what ``manylights bench`` wrote.
@@ -48,17 +36,18 @@ def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, 
         publish: leave out pictures and file names of private scenes.
 
     Returns:
-        The page's path, and remarks on what was left out.
+        The page's path, and remarks on what was left out or left as it is.
     """
-    data = results.load(folder)
+    data = records.load(folder)
     target = files.check_output(output or str(data.folder / PAGE_NAME))
     text, remarks = render(data, publish)
     with files.written_whole(target) as partial:
         partial.write_text(text, encoding="utf-8")
+    remarks += markdown.write_readme(data, data.folder / CHART_FOLDER)
     return target, remarks
 
 
-def render(data: results.Results, publish: bool) -> tuple[str, list[str]]:
+def render(data: records.Results, publish: bool) -> tuple[str, list[str]]:
     """Return the page's text and remarks; write the charts."""
     remarks = list(data.remarks)
     visible = _scene_pictures(data, publish, remarks)
@@ -109,7 +98,7 @@ def _environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters.update(
-        number=_number, ratio=_ratio, percent=_percent, svg=_svg_uri, count=lambda n: f"{n:,}"
+        number=number, ratio=ratio, percent=percent, svg=_svg_uri, count=lambda n: f"{n:,}"
     )
     return environment
 
@@ -137,7 +126,7 @@ def _steps(deviations: charts.Deviations) -> list[Steps]:
 def _methods(data) -> dict[str, str]:
     """The measured methods in the order of charts, with what they do."""
     measured = {series.method for scene in data.scenes for series in scene.series}
-    known = {method: text for method, text in METHODS.items() if method in measured}
+    known = {method: about.meaning for method, about in ABOUT.items() if method in measured}
     return {**known, **{method: "" for method in sorted(measured - set(known))}}
 
 
@@ -151,25 +140,6 @@ def _seeds(data) -> str:
     }
     ends = sorted({min(counts, default=0), max(counts, default=0)})
     return " to ".join(map(str, ends))
-
-
-def _number(value: Any) -> str:
-    """Write a number with three digits, without needless zeros in the exponent."""
-    if value is None or not np.isfinite(value):
-        return "n/a"
-    text = f"{value:,.0f}" if 1000 <= abs(value) < 1e7 else f"{value:.3g}"
-    return text.replace("e-0", "e-").replace("e+0", "e")
-
-
-def _ratio(interval: statistics.Interval) -> str:
-    if not interval.known:
-        return f"{_number(interval.value)} (one seed)"
-    return f"{_number(interval.value)} ({_number(interval.low)} to {_number(interval.high)})"
-
-
-def _percent(value: float) -> str:
-    sign = "-" if value < 0 else "+"
-    return "n/a" if not np.isfinite(value) else f"{sign}{_number(abs(100 * value))} %"
 
 
 def _svg_uri(chart: charts.Chart) -> str:

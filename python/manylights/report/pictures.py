@@ -13,10 +13,10 @@ import matplotlib.image
 import numpy as np
 
 from manylights.bench import metrics
-from manylights.errors import UsageError, one_line
+from manylights.bench.records import Scene, Series
+from manylights.errors import UsageError
+from manylights.output import channels
 from manylights.report import grouping
-from manylights.report.results import Scene, Series
-from manylights.threads import threads_for_files
 
 #: Share of the reference's pixels that the exposure leaves below white.
 BELOW_WHITE = 0.97
@@ -30,8 +30,6 @@ ERROR_COLORS, COUNT_COLORS = "inferno", "viridis"
 MAX_ERROR = 1e12
 #: Columns on each side over which a step of the standard deviation is measured.
 STEP_WIDTH = 3
-
-MAPS = {"candidates": "Candidates (N')", "node_visits": "Node visits"}
 
 
 @dataclass(frozen=True)
@@ -137,9 +135,9 @@ def largest_step(line: np.ndarray) -> float:
 
 def read_image(scene: Scene, name: str) -> np.ndarray:
     """Read three colour channels of an image of ``scene``."""
-    channels = _read(scene, name)
+    found = _read(scene, name)
     try:
-        return np.stack([channels[channel] for channel in "RGB"], axis=-1)
+        return np.stack([found[channel] for channel in channels.RGB], axis=-1)
     except KeyError as error:
         raise UsageError(f"{scene.folder / name}: no channel {error}") from None
 
@@ -154,18 +152,12 @@ def _read(scene: Scene, name: str) -> dict[str, np.ndarray]:
     path: Path = scene.folder / name
     if not path.exists():
         raise UsageError(f"{path}: no such file, though results.json says that it was rendered")
-    try:
-        with threads_for_files():
-            bitmap = mi.Bitmap(str(path))
-    except Exception as error:
-        raise UsageError(f"{path}: not readable: {one_line(error)}") from None
-    data = np.array(bitmap).astype(np.float32)
-    if data.shape[:2] != (scene.height, scene.width):
-        size = f"{data.shape[1]} x {data.shape[0]}"
+    bitmap = channels.read(path)
+    width, height = bitmap.size()
+    if (height, width) != (scene.height, scene.width):
+        size = f"{width} x {height}"
         raise UsageError(f"{path}: {size} pixels instead of {scene.width} x {scene.height}")
-    data = data.reshape(scene.height, scene.width, -1)
-    names = [entry.name for entry in bitmap.struct_()]
-    return {name: data[..., index] for index, name in enumerate(names)}
+    return channels.split(bitmap)
 
 
 def _exposure(reference: np.ndarray) -> float:
@@ -252,16 +244,16 @@ def _count_maps(scene: Scene, chosen: list[Series], remarks: list[str]) -> list[
                 found.append((series, _read(scene, name)))
             else:
                 remarks.append(f"{scene.name}/{name}: missing, its maps are left out")
-    for series, channels in found:
-        lacking = ", ".join(key for key in MAPS if key not in channels)
+    for series, counts in found:
+        lacking = ", ".join(key for key in channels.WORK if key not in counts)
         if lacking:
             remarks.append(f"{scene.name}/{series.key}.maps.exr: has no channel {lacking}")
-    rows = [_count_row(title, key, found) for key, title in MAPS.items()]
+    rows = [_count_row(channels.COUNTS[key], key, found) for key in channels.WORK]
     return [row for row in rows if row]
 
 
 def _count_row(title: str, key: str, found: list) -> MapRow | None:
-    counts = [(series, channels[key]) for series, channels in found if key in channels]
+    counts = [(series, parts[key]) for series, parts in found if key in parts]
     if not counts:
         return None
     high = max(float(np.quantile(count, 0.995)) for _, count in counts) or 1.0

@@ -9,9 +9,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from manylights.bench.records import Scene
 from manylights.report.charts import STYLE, plain, save
 from manylights.report.pictures import MapRow, Picture, ScenePictures
-from manylights.report.results import Scene
 
 # All in inches: the width of a picture and the gap between two, what a line of text takes, the
 # place of a colour scale with its numbers, and the margin.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from manylights.report.results import Point, Scene, Series
+from manylights.bench.records import Point, Scene, Series
 
 #: Two-sided level of all intervals.
 LEVEL = 0.95
@@ -41,19 +41,19 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SampleMean:
     """An estimated mean (or its logarithm), its variance, and the degrees of freedom of that."""
 
     value: float
     variance: float
     freedom: float
 
-    def __sub__(self, other: Estimate) -> Estimate:
+    def __sub__(self, other: SampleMean) -> SampleMean:
         """The difference of two independent estimates, after Welch and Satterthwaite."""
         total = self.variance + other.variance
         parts = self.variance**2 / self.freedom + other.variance**2 / other.freedom
         freedom = total**2 / parts if parts > 0 else math.inf
-        return Estimate(self.value - other.value, total, freedom)
+        return SampleMean(self.value - other.value, total, freedom)
 
     def interval(self) -> Interval:
         quantile = float(stdtrit(min(self.freedom, 1e9), (1 + LEVEL) / 2))
@@ -65,18 +65,18 @@ class Estimate:
         return Interval(math.exp(inner.value), math.exp(inner.low), math.exp(inner.high))
 
 
-def mean_of(values: np.ndarray) -> Estimate:
-    """Estimate the mean of independent values."""
+def mean_of(values: np.ndarray) -> SampleMean:
+    """SampleMean the mean of independent values."""
     count = len(values)
     if count == 1:
-        return Estimate(float(values[0]), math.nan, 1)
-    return Estimate(float(values.mean()), float(values.var(ddof=1)) / count, count - 1)
+        return SampleMean(float(values[0]), math.nan, 1)
+    return SampleMean(float(values.mean()), float(values.var(ddof=1)) / count, count - 1)
 
 
-def log_mean_of(values: np.ndarray) -> Estimate:
-    """Estimate the logarithm of the mean of independent positive values."""
+def log_mean_of(values: np.ndarray) -> SampleMean:
+    """SampleMean the logarithm of the mean of independent positive values."""
     mean = mean_of(values)
-    return Estimate(math.log(mean.value), mean.variance / mean.value**2, mean.freedom)
+    return SampleMean(math.log(mean.value), mean.variance / mean.value**2, mean.freedom)
 
 
 def error_interval(point: Point) -> Interval:
@@ -95,7 +95,7 @@ def last_clear_point(series: Series, scene: Scene) -> Point:
     return clear[-1] if clear else series.points[0]
 
 
-def cost(series: Series, scene: Scene, metric: str = "error_trimmed") -> Estimate:
+def cost(series: Series, scene: Scene, metric: str = "error_trimmed") -> SampleMean:
     """The logarithm of error times time: the error after one second if it falls as 1 / time."""
     point = last_clear_point(series, scene)
     return log_mean_of(getattr(point, metric) * point.seconds)
@@ -109,7 +109,7 @@ def gain(peer: Series, ours: Series, scene: Scene, metric: str = "error_trimmed"
 def bias(series: Series, scene: Scene) -> Interval:
     """Mean of all pixels relative to the reference's, minus 1, with the errors of both."""
     reference = scene.reference
-    truth = Estimate(reference["mean"], reference["mean_error"] ** 2, math.inf)
+    truth = SampleMean(reference["mean"], reference["mean_error"] ** 2, math.inf)
     difference = (mean_of(series.points[-1].mean) - truth).interval()
     scale = reference["mean"] or math.nan
     return Interval(*(end / scale for end in (difference.value, difference.low, difference.high)))

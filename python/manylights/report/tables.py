@@ -6,8 +6,8 @@ import math
 import statistics
 from dataclasses import dataclass
 
+from manylights.bench.records import Results, Scene, Series
 from manylights.report import grouping
-from manylights.report.results import Results, Scene, Series
 from manylights.report.statistics import (
     Interval,
     bias,

@@ -6,37 +6,38 @@ import sys
 
 from manylights.errors import UsageError
 
-REPORT_HELP = """\
+HELP = """\
 Reads what "manylights bench" wrote to DIR and makes one HTML page of it that needs no other
-file. Its charts are also written to DIR/charts as PNG and SVG: overview, error_time_SCENE,
-reach_ERROR, lights_FAMILY, sweep_PARAMETER_SCENE, boundary_SCENE and pictures_SCENE.
+file, and DIR/README.md with the most important tables. The page's charts are also written to
+DIR/charts as PNG and SVG: overview, error_time_SCENE, reach_ERROR, lights_FAMILY,
+sweep_PARAMETER_SCENE, boundary_SCENE and pictures_SCENE.
 """
 
 #: Packages that only this command and the measuring need.
 EXTRA_PACKAGES = ("jinja2", "matplotlib", "scipy")
 
 
-def add_report(commands, common) -> None:
-    """Add ``report`` to the parser's ``commands``; ``common`` has the options of all commands."""
-    report = commands.add_parser(
+def add(commands, common) -> None:
+    """Add the command to the subparsers ``commands``; ``common`` has the options of all."""
+    parser = commands.add_parser(
         "report",
         parents=[common],
         help="make a web page and charts of measurements",
-        description=REPORT_HELP,
+        description=HELP,
     )
-    report.add_argument("folder", metavar="DIR", help="what bench wrote")
-    report.add_argument(
+    parser.add_argument("folder", metavar="DIR", help="what bench wrote")
+    parser.add_argument(
         "-o", "--output", metavar="PAGE.html", help="page to write (default: DIR/report.html)"
     )
-    report.add_argument(
+    parser.add_argument(
         "--publish",
         action="store_true",
         help="leave out pictures and file names of private scenes, keep their numbers",
     )
-    report.set_defaults(command=_report)
+    parser.set_defaults(command=_run)
 
 
-def _report(options) -> None:
+def _run(options) -> None:
     write_report = _import_writer()
     written, remarks = write_report(options.folder, options.output, options.publish)
     for remark in remarks:

@@ -1,27 +1,23 @@
-"""The file ``results.json`` of a measurement: read, checked, and written whole after each step."""
+"""The folder of a measurement: ``results.json`` and images, written whole after each step."""
 
 from __future__ import annotations
 
 import json
 import os
-import platform
 import threading
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights import files, images
-from manylights.bench import metrics
+from manylights import files
+from manylights.bench import machine, metrics, records
 from manylights.bench.methods import Method
 from manylights.bench.scene_source import Source
-from manylights.errors import UsageError, one_line
-from manylights.threads import threads_for_files
-
-FORMAT, NAME = 1, "results.json"
+from manylights.errors import UsageError
+from manylights.output import channels, images
 
 #: What must be the same for results to be continued: times of two machines do not compare, and
 #: other versions may compute something else.
@@ -29,7 +25,7 @@ SAME_VERSIONS = ("manylights", "mitsuba", "drjit")
 SAME_MACHINE = ("processor", "threads")
 
 
-class Results:
+class Folder:
     """The results in a folder.
 
     Attributes:
@@ -45,24 +41,19 @@ class Results:
         """Write ``results.json``, whole or not at all."""
         scenes = [_without_empty_points(entry) for entry in self.data["scenes"]]
         text = json.dumps({**self.data, "scenes": scenes}, indent=1, allow_nan=False)
-        with self.writing, files.written_whole(self.folder / NAME) as partial:
+        with self.writing, files.written_whole(self.folder / records.FILE) as partial:
             partial.write_text(text)
 
-    def write_image(self, scene: str, name: str, pixels: np.ndarray, channels: list[str]) -> None:
+    def write_image(self, scene: str, name: str, pixels: np.ndarray, names) -> None:
         """Write ``SCENE/NAME.exr``, whole or not at all, in single precision."""
         target = self.folder / scene / f"{name}.exr"
-        size = [pixels.shape[1], pixels.shape[0]]
-        formats, kind = mi.Bitmap.PixelFormat, mi.Struct.Type.Float32
-        # Made of an array, a bitmap calls its channels Y and A or R, G and B.
-        bitmap = mi.Bitmap(formats.MultiChannel, kind, size, len(channels), channels)
-        np.array(bitmap, copy=False)[:] = pixels
+        bitmap = channels.join(names, pixels)
         with self.writing:
             images.write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)
 
     def read_reference(self, scene: str) -> np.ndarray:
         """Return the reference of a scene, shape (height, width, 3)."""
-        with threads_for_files():
-            return np.array(mi.Bitmap(str(self.folder / scene / "reference.exr")))
+        return channels.read_colors(self.folder / scene / "reference.exr")
 
     def has_image(self, scene: str, name: str) -> bool:
         """Is there ``SCENE/NAME.exr``?"""
@@ -104,10 +95,10 @@ class Results:
         for path in (*folder.glob("*.exr"), *folder.glob("*.npz")):
             path.unlink()
         origin = {"source": source.text, "hash": source.fingerprint}
-        return {**facts, **origin, "reference": None, "series": [], "skipped": []}
+        return records.new_scene({**facts, **origin})
 
 
-def open_folder(folder: str, variant: str) -> Results:
+def open_folder(folder: str, variant: str) -> Folder:
     """Return the results in a folder, or empty ones in a new folder.
 
     Args:
@@ -128,14 +119,14 @@ def open_folder(folder: str, variant: str) -> Results:
     if not os.access(path, os.W_OK | os.X_OK):
         raise UsageError(f"--out {folder}: not writable")
     fresh = _fresh(variant)
-    if not (path / NAME).exists():
-        return Results(path, fresh)
-    data = _read(path / NAME)
+    if not (path / records.FILE).exists():
+        return Folder(path, fresh)
+    data = records.read(path / records.FILE)
     for what, old, new in _differences(data, fresh):
         raise UsageError(
             f"--out {folder}: has results with {what} {old}, this is {new}; choose another folder"
         )
-    return Results(path, data)
+    return Folder(path, data)
 
 
 def series_of(entry: dict[str, Any], method: Method) -> dict[str, Any] | None:
@@ -170,73 +161,14 @@ def _without_empty_points(entry: dict[str, Any]) -> dict[str, Any]:
 
 def _fresh(variant: str) -> dict[str, Any]:
     return {
-        "format": FORMAT,
+        "format": records.FORMAT,
         "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "versions": _versions(),
-        "machine": _machine(),
+        "versions": machine.versions(),
+        "machine": machine.describe(),
         "variant": variant,
         "metric": {"epsilon": metrics.EPSILON, "trim": metrics.TRIM},
         "scenes": [],
     }
-
-
-def _versions() -> dict[str, str]:
-    from manylights import __version__
-
-    return {
-        "manylights": __version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-    }
-
-
-def _machine() -> dict[str, Any]:
-    text = _text_of("/proc/cpuinfo")
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if "model name" in line]
-    return {
-        "processor": names[0] if names else platform.processor() or platform.machine(),
-        "cores": _cores(text),
-        "threads": dr.thread_count(),
-        "memory_gib": _memory_gib(),
-        "system": " ".join([platform.system(), platform.machine(), *platform.libc_ver()]).strip(),
-    }
-
-
-def _cores(cpuinfo: str) -> int:
-    """Return the number of cores, of processors where the system does not say."""
-    chips = [line for line in cpuinfo.splitlines() if line.startswith(("physical id", "core id"))]
-    pairs = set(zip(chips[::2], chips[1::2]))
-    return len(pairs) or os.cpu_count() or 1
-
-
-def _memory_gib() -> float | None:
-    try:
-        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (OSError, ValueError, AttributeError):
-        return None
-    return round(size / 2**30, 1)
-
-
-def _text_of(path: str) -> str:
-    try:
-        return Path(path).read_text()
-    except OSError:
-        return ""
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(path.read_text())
-        usable = data["format"] == FORMAT and isinstance(data["scenes"], list)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{path}: not results of manylights bench ({one_line(error)})") from error
-    if not usable:
-        raise UsageError(
-            f"{path}: results of format {data['format']}, can go on with {FORMAT} only"
-        )
-    return data
 
 
 def _differences(data: dict[str, Any], fresh: dict[str, Any]):

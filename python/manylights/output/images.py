@@ -7,6 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from manylights import files
+from manylights.output import channels
 from manylights.threads import threads_for_files
 
 
@@ -40,12 +41,10 @@ def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
 
 def _preview(bitmap):
     """Return an 8-bit sRGB version of the colour channels, None if there are none."""
-    formats = mi.Bitmap.PixelFormat
-    if bitmap.pixel_format() == formats.MultiChannel:
-        bitmap = dict(bitmap.split()).get("<root>", bitmap)
-    if bitmap.pixel_format() == formats.MultiChannel:
+    picture = channels.colors(bitmap)
+    if picture is None:
         return None
-    return bitmap.convert(formats.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    return picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
 
 
 def write_whole(bitmap, target: Path, file_format) -> Path:

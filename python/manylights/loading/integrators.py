@@ -7,38 +7,68 @@ are found like any other.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
 
 from manylights.errors import UsageError
+from manylights.output import channels
 
 #: Our plugins: direct light on surfaces, and paths through surfaces and media.
 DIRECT, VOLPATH = "manylights_direct", "manylights_volpath"
 
+#: Values of the parameter ``method``, the default first.
+METHODS = ("resampled_tree", "talk", "adaptive_splitting", "tree", "exhaustive")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a parameter of ours may be, for help and error messages. The plugins check values.
+
+    Attributes:
+        allowed: type and range, in words.
+        default: of the plugins.
+        remark: what else is to be known.
+        symbol: in formulas, for charts of parameters that are swept.
+    """
+
+    allowed: str
+    default: Any
+    remark: str = ""
+    symbol: str = ""
+
+    def __str__(self) -> str:
+        remark = f", {self.remark}" if self.remark else ""
+        return f"{self.allowed}, default {value_text(self.default)}{remark}"
+
+
+BOOLEAN = "true or false"
+HIDE_EMITTERS = Parameter(BOOLEAN, False)
+
 #: What both plugins accept to steer and to watch the choice of lights.
 SAMPLING_PARAMETERS = {
-    "splitting_rate": "float >= 0 or inf, default 1",
-    "reservoirs": "integer from 1 to 64, default 8",
-    "shadow_rays": "integer from 1 to the number of reservoirs, default 4",
-    "method": "resampled_tree, talk, adaptive_splitting, tree, exhaustive, default resampled_tree",
-    "split_function": "near or far, default near, for method=talk only",
-    "learn_visibility": "true, false or keep, default true, for method=resampled_tree only",
-    "counts": "true or false, default false, adds channels candidates, node_visits, expected",
+    "splitting_rate": Parameter("float >= 0 or inf", 1.0, symbol="gamma"),
+    "reservoirs": Parameter("integer from 1 to 64", 8, symbol="m"),
+    "shadow_rays": Parameter("integer from 1 to the number of reservoirs", 4, symbol="s"),
+    "method": Parameter(", ".join(METHODS), METHODS[0]),
+    "split_function": Parameter("near or far", "near", "for method=talk only"),
+    "learn_visibility": Parameter("true, false or keep", True, f"for method={METHODS[0]} only"),
+    "counts": Parameter(BOOLEAN, False, f"adds channels {', '.join(channels.COUNTS)}"),
 }
 
-#: What each plugin accepts, for error messages and help. The plugins themselves check the values.
+#: What each plugin accepts.
 PARAMETERS = {
     DIRECT: {
         **SAMPLING_PARAMETERS,
-        "bsdf_samples": "integer >= 0, default 1",
-        "hide_emitters": "true or false, default false",
+        "bsdf_samples": Parameter("integer >= 0", 1),
+        "hide_emitters": HIDE_EMITTERS,
     },
     VOLPATH: {
-        "max_depth": "integer, -1 for no limit, default -1",
-        "rr_depth": "integer >= 1, default 5",
+        "max_depth": Parameter("integer, -1 for no limit", -1),
+        "rr_depth": Parameter("integer >= 1", 5),
         **SAMPLING_PARAMETERS,
-        "hide_emitters": "true or false, default false",
+        "hide_emitters": HIDE_EMITTERS,
     },
 }
 
@@ -81,6 +111,13 @@ def parse_value(text: str) -> bool | int | float | str:
         except ValueError:
             continue
     return text
+
+
+def value_text(value: Any) -> str:
+    """Return a value as it is typed after ``--set name=``."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def parse_assignments(items: list[str], option: str) -> dict[str, str]:

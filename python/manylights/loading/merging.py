@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights.integrators import PARAMETERS, leaf_integrators
+from manylights.loading.integrators import PARAMETERS, leaf_integrators
 
 #: Parameters of shapes that say what the mesh is. Shapes with any other stay as they are.
 GEOMETRY = {

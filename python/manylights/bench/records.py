@@ -1,20 +1,25 @@
-"""Reads ``results.json`` and checks it, so that everything after this can rely on it."""
+"""The file ``results.json``: what it holds, new entries for it, and reading it with all checks.
+
+``bench`` writes it, ``report`` reads it; the tables below are the only place that says what is in
+it. A new number is added to one of them, and to the class of the same name if the report shows it.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from manylights.bench.methods import MITSUBAS, OURS
 from manylights.errors import UsageError
 
-#: The only version of the files that this module reads.
-FORMAT = 1
+#: Name of the file, and the only version of it that this module reads.
+FILE, FORMAT = "results.json", 1
 
 NUMBER = (int, float)
 #: Names become parts of paths: nothing that leaves the folder or hides a file.
@@ -30,12 +35,15 @@ class Maybe:
 
 
 # What the file has to hold: types, lists of one kind, and objects with at least these names.
+# Lists of a point have one value a seed, but FLIP, which the first seeds alone have.
 POINT = {
     "spp": int,
+    "seed": [int],
     "seconds": [NUMBER],
     "cpu_seconds": [NUMBER],
     "error": [NUMBER],
     "error_trimmed": [NUMBER],
+    "flip": [NUMBER],
     "mean": [NUMBER],
 }
 EQUAL_TIME = {
@@ -49,6 +57,7 @@ SERIES = {
     "spec": str,
     "method": str,
     "parameters": dict,
+    "integrator": dict,
     "build_seconds": NUMBER,
     "first_seconds": NUMBER,
     "equal_time": Maybe(EQUAL_TIME),
@@ -68,6 +77,7 @@ SCENE = {
     "family": Maybe(str),
     "lights": int,
     "source": str,
+    "hash": str,
     "width": int,
     "height": int,
     "max_depth": Maybe(int),
@@ -78,8 +88,10 @@ SCENE = {
     "reference": Maybe(REFERENCE),
     "series": [SERIES],
     "skipped": Maybe([{"spec": str, "why": str}]),
+    "finished": Maybe(bool),
 }
 RESULTS = {
+    "format": int,
     "created": str,
     "versions": dict,
     "machine": dict,
@@ -121,12 +133,12 @@ class Series:
     @property
     def ours(self) -> bool:
         """Whether this is the method that the others are compared with."""
-        return self.method == "resampled_tree"
+        return self.method == OURS[0]
 
     @property
     def mitsubas(self) -> bool:
         """Whether this is Mitsuba's own integrator, which has no parameters and no tree."""
-        return self.method in ("uniform", "power")
+        return self.method in MITSUBAS
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,15 +181,40 @@ class Results:
     remarks: list[str]
 
 
-def load(folder: str) -> Results:
-    """Read ``folder``/results.json.
+def new_point(spp: int) -> dict[str, Any]:
+    """Return an entry for renders of so many samples per pixel, without any."""
+    return {name: [] if isinstance(kind, list) else spp for name, kind in POINT.items()}
+
+
+def new_series(
+    spec: str, method: str, parameters: dict[str, Any], integrator: dict[str, Any]
+) -> dict[str, Any]:
+    """Return an entry for a method that has not been rendered."""
+    return {
+        "spec": spec,
+        "method": method,
+        "parameters": parameters,
+        "integrator": integrator,
+        "build_seconds": 0.0,
+        "first_seconds": 0.0,
+        "equal_time": None,
+        "points": [],
+    }
+
+
+def new_scene(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return an entry for a scene that has not been measured; ``facts`` has what is known."""
+    return {**facts, "reference": None, "series": [], "skipped": []}
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Return the content of the file, checked.
 
     Raises:
         UsageError: no such file, or it is not what ``manylights bench`` writes; the text names
             the file, the place in it, and what is wrong.
     """
-    path = Path(folder) / "results.json"
-    data = _read(path)
+    data = _read_json(path)
     try:
         _check_format(data)
         _check(data, RESULTS, "")
@@ -186,14 +223,24 @@ def load(folder: str) -> Results:
         _check_distinct([scene["name"] for scene in data["scenes"]], "scenes")
     except ValueError as error:
         raise UsageError(f"{path}: {error}") from None
+    return data
+
+
+def load(folder: str) -> Results:
+    """Return what ``folder``/results.json holds and can be shown.
+
+    Raises:
+        UsageError: as ``read``.
+    """
+    path = Path(folder) / FILE
+    data = read(path)
     remarks: list[str] = []
     found = [_scene(path.parent, scene, remarks) for scene in data["scenes"]]
     scenes = [scene for scene in found if scene]
-    fields = _fields(data, RESULTS, "scenes")
-    return Results(path.parent, **fields, scenes=scenes, remarks=remarks)
+    return Results(**_known(Results, data), folder=path.parent, scenes=scenes, remarks=remarks)
 
 
-def _read(path: Path) -> Any:
+def _read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -206,7 +253,7 @@ def _read(path: Path) -> Any:
 
 def _check_format(data: Any) -> None:
     if not isinstance(data, dict) or "format" not in data:
-        raise ValueError("format: missing, this is not a file of manylights bench")
+        raise ValueError("format: missing, these are not results of manylights bench")
     if data["format"] != FORMAT:
         raise ValueError(f"format: {data['format']!r} is unknown, this version reads {FORMAT}")
 
@@ -287,7 +334,7 @@ def _scene(folder: Path, entry: dict[str, Any], remarks: list[str]) -> Scene | N
         return None
     series = [_series(one, name, remarks) for one in entry["series"]]
     series = [one for one in series if one.points]
-    return Scene(folder / name, **_fields(entry, SCENE, "series"), series=series)
+    return Scene(**_known(Scene, entry), folder=folder / name, series=series)
 
 
 def _series(entry: dict[str, Any], scene: str, remarks: list[str]) -> Series:
@@ -296,7 +343,7 @@ def _series(entry: dict[str, Any], scene: str, remarks: list[str]) -> Series:
     if len(points) < len(entry["points"]) or not points:
         remarks.append(f"{scene}, {entry['spec']}: points not rendered yet, or with error 0")
     points.sort(key=lambda point: point.spp)
-    return Series(**_fields(entry, SERIES, "points"), points=points)
+    return Series(**_known(Series, entry), points=points)
 
 
 def _is_positive(point: dict[str, Any]) -> bool:
@@ -305,10 +352,14 @@ def _is_positive(point: dict[str, Any]) -> bool:
 
 
 def _point(entry: dict[str, Any]) -> Point:
-    names = ("seconds", "cpu_seconds", "error", "error_trimmed", "mean")
+    names = (one.name for one in fields(Point) if one.name != "spp")
     return Point(entry["spp"], **{name: np.array(entry[name], float) for name in names})
 
 
-def _fields(entry: dict[str, Any], kind: dict[str, Any], without: str) -> dict[str, Any]:
-    """The values of ``entry`` that ``kind`` names, None for those that are missing."""
-    return {name: entry.get(name) for name in kind if name != without}
+def _known(kind: type, entry: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of an entry for the fields of a class that are not made of others.
+
+    They are None where the entry has none.
+    """
+    made = ("folder", "scenes", "series", "points", "remarks")
+    return {one.name: entry.get(one.name) for one in fields(kind) if one.name not in made}

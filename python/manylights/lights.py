@@ -6,7 +6,8 @@ from collections import Counter
 
 import mitsuba as mi
 
-from manylights import integrators, loading
+from manylights import loading
+from manylights.loading import integrators
 from manylights.threads import threads_for_files
 
 #: What the integrator publishes once the tree is built, in the order of the report.
@@ -26,24 +27,29 @@ KINDS = {
 }
 
 
-def describe(path: str, defines: dict[str, str] | None = None) -> dict:
-    """Build the light tree of an XML scene and return what it is like.
+def describe(
+    path: str,
+    defines: dict[str, str] | None = None,
+    usd_options: loading.UsdOptions | None = None,
+) -> dict:
+    """Build the light tree of a scene and return what it is like.
 
     If the scene names an integrator of ours, it builds the tree, with those of its parameters that
     concern the tree; otherwise ``manylights_direct`` does, with default parameters.
 
     Args:
-        path: the XML file.
-        defines: values for the scene's ``<default>`` parameters. Default: none.
+        path: an XML file or a USD stage.
+        defines: values for the ``<default>`` parameters of XML. Default: none.
+        usd_options: how a stage is read. Default: as ``loading.UsdOptions()`` has it.
 
     Returns:
         The numbers named in ``KEYS`` (``bytes`` of memory, ``build_ms`` milliseconds) and
         ``kinds``, a dictionary from the kind of light to its count.
     """
     with loading.search_beside(path), threads_for_files():
-        config, state = loading.parse(path, defines or {})
-        plugin, parameters = integrators.ours_in(state)
-        scene = loading.instantiate(config, state)
+        parsed = loading.parse(path, defines, usd_options)
+        plugin, parameters = integrators.ours_in(parsed.state)
+        scene = loading.instantiate(parsed)
     integrator = mi.load_dict({"type": plugin, **parameters})
     integrator.render(scene, sensor=_tiny_sensor(), seed=0, spp=1)
     values = mi.traverse(integrator)

@@ -1,0 +1,60 @@
+"""What a measurement ran on: the machine and the versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of all that computes."""
+    from manylights import __version__
+
+    return {
+        "manylights": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+    }
+
+
+def describe() -> dict[str, Any]:
+    """Return processor, cores, threads, memory and system, for JSON."""
+    text = _text_of("/proc/cpuinfo")
+    names = [line.partition(":")[2].strip() for line in text.splitlines() if "model name" in line]
+    return {
+        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "cores": _cores(text),
+        "threads": dr.thread_count(),
+        "memory_gib": _memory_gib(),
+        "system": " ".join([platform.system(), platform.machine(), *platform.libc_ver()]).strip(),
+    }
+
+
+def _cores(cpuinfo: str) -> int:
+    """Return the number of cores, of processors where the system does not say."""
+    chips = [line for line in cpuinfo.splitlines() if line.startswith(("physical id", "core id"))]
+    pairs = set(zip(chips[::2], chips[1::2]))
+    return len(pairs) or os.cpu_count() or 1
+
+
+def _memory_gib() -> float | None:
+    try:
+        size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return round(size / 2**30, 1)
+
+
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).read_text()
+    except OSError:
+        return ""

@@ -1,0 +1,57 @@
+"""The command ``manylights demo``."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from manylights import lights, loading, scenes
+from manylights.cli import options as shared
+from manylights.cli.render import render_to
+from manylights.loading import integrators
+from manylights.output import images
+from manylights.progress import say
+from manylights.rendering import Job
+
+HELP = """\
+Generates a city at night with thousands of lights, renders it, and says how long that took.
+"""
+
+
+def add(commands, common) -> None:
+    """Add the command to the subparsers ``commands``; ``common`` has the options of all."""
+    parser = commands.add_parser(
+        "demo", parents=[common], help="render a city with many lights", description=HELP
+    )
+    parser.add_argument(
+        "-o", "--output", default="city", metavar="PREFIX", help="of both images (default: city)"
+    )
+    positive = shared.positive
+    parser.add_argument(
+        "--lights", type=positive, default=20000, help="number of lights (default: 20000)"
+    )
+    parser.add_argument(
+        "--spp", type=positive, help="samples per pixel (default: 64, scalar variants 16)"
+    )
+    parser.add_argument("--width", type=positive, default=640, help="in pixels (default: 640)")
+    parser.add_argument("--height", type=positive, default=360, help="in pixels (default: 360)")
+    shared.add_machine(parser)
+    parser.set_defaults(command=_run)
+
+
+def _run(options) -> None:
+    target = images.check_output(f"{options.output}.exr")
+    variant = shared.start(options)
+    spp = options.spp or (16 if variant.startswith("scalar") else 64)
+    description = scenes.city(
+        options.lights,
+        seed=options.seed,
+        width=options.width,
+        height=options.height,
+        spp=spp,
+        integrator={"type": integrators.DIRECT, "block_size": integrators.BLOCK_SIZE},
+    )
+    loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
+    count = sum(lights.count_kinds(loaded.scene).values())
+    say(f"lights: {count:,}")
+    seconds = render_to(Job.of(loaded, spp=spp, seed=options.seed), target, options.threads)
+    print(f"{count:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")

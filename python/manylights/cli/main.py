@@ -1,0 +1,67 @@
+"""Puts the commands together, and turns errors into one line and an exit status."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from manylights.cli import bench, compare, demo, render, report, tree
+from manylights.errors import one_line
+from manylights.progress import INTERRUPTED
+
+#: Exit status of a command that could not do what was asked.
+FAILURE = 2
+
+#: In the order of the help; each has ``add(commands, common)``.
+COMMANDS = (render, tree, demo, bench, compare, report)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return the exit status: 0, 2 for errors, 130 after Ctrl-C.
+
+    ``compare`` returns 1, too, for images that differ.
+
+    Args:
+        arguments: what follows the command's name. Default: what the process was started with.
+    """
+    options = parser().parse_args(arguments)
+    try:
+        return options.command(options) or 0
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if options.debug:
+            raise
+        print(f"manylights: {one_line(error)}", file=sys.stderr)
+        return FAILURE
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands; what it parses has the function ``command``."""
+    from manylights import __version__
+
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    made = argparse.ArgumentParser(
+        prog="manylights", description="Renders scenes with very many lights."
+    )
+    made.add_argument("--version", action="version", version=__version__)
+    commands = made.add_subparsers(metavar="COMMAND", required=True)
+    folder = commands.add_parser(
+        "plugin-dir", parents=[common], help='print the folder for: mitsuba -a "$(...)" scene.xml'
+    )
+    folder.set_defaults(command=_plugin_dir)
+    for command in COMMANDS:
+        command.add(commands, common)
+    return made
+
+
+def _plugin_dir(options) -> None:
+    import manylights
+
+    print(manylights.plugin_dir())

@@ -1,0 +1,161 @@
+"""Reads a scene file into Mitsuba's parsed form, and makes objects of it.
+
+The ending of the file's name chooses the reader; after it XML and USD go the same way.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import mitsuba as mi
+
+from manylights.errors import UsageError, one_line
+
+#: Endings of USD stages: whichever format, in text, binary, and packed.
+USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
+
+
+@dataclass(frozen=True)
+class UsdOptions:
+    """How a USD stage is read: the arguments of ``manylights.usd.load``, which says what each is.
+
+    A new one is added there, here, and in ``cli/options.py``.
+    """
+
+    time: float | None = None
+    camera: str | None = None
+    purposes: tuple[str, ...] = ("default", "render")
+    subdivision: int | None = None
+    default_light: bool = False
+    legacy_lights: bool = False
+    blender_light_units: bool = False
+
+
+@dataclass
+class ParsedScene:
+    """A scene before any object exists.
+
+    Attributes:
+        config: ``mi.parser.ParserConfig`` to make the objects with.
+        state: ``mi.parser.ParserState``: nodes with their properties.
+        files: what it was read from, the scene file first, and the files that it refers to.
+        notes: what the reader has to say, lines for the log.
+    """
+
+    config: object
+    state: object
+    files: list[Path]
+    notes: list[str] = field(default_factory=list)
+
+
+def parse(
+    path: str, defines: dict[str, str] | None = None, usd_options: UsdOptions | None = None
+) -> ParsedScene:
+    """Parse a scene, upgraded to this Mitsuba, not transformed. Inside of ``search_beside``.
+
+    Args:
+        path: an XML file, or a USD stage if it ends in one of ``USD_ENDINGS``.
+        defines: values for the ``<default>`` parameters of XML, by name. Default: none.
+        usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
+
+    Raises:
+        UsageError: there is no such file, usd-core is missing, or ``defines`` for a stage.
+        RuntimeError: Mitsuba cannot read it.
+    """
+    if not Path(path).is_file():
+        raise UsageError(f"{path}: no such file")
+    config = mi.parser.ParserConfig(mi.variant())
+    if Path(path).suffix.lower() in USD_ENDINGS:
+        return _parse_usd(config, path, defines or {}, usd_options or UsdOptions())
+    state = mi.parser.parse_file(config, str(path), **(defines or {}))
+    mi.parser.transform_upgrade(config, state)
+    return ParsedScene(config, state, files_of(state))
+
+
+def _parse_usd(config, path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
+    if defines:
+        raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
+    try:
+        from manylights import usd
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "pxr":
+            raise
+        raise UsageError(
+            f"{path}: USD needs the package usd-core, install it with: "
+            "pip install 'manylights[usd]'"
+        ) from error
+    description = usd.load(path, **asdict(options))
+    state = mi.parser.parse_dict(config, description)
+    # A stage composes layers that no node of the scene names.
+    layers = [Path(file) for file in getattr(description, "files", (path,))]
+    return ParsedScene(
+        config, state, [*layers, *files_of(state)], [note.text for note in description.notes]
+    )
+
+
+def files_of(state) -> list[Path]:
+    """Return the XML files of a parsed scene and the files that it refers to.
+
+    Inside of ``search_beside``: Mitsuba looks for them as it will when it makes the scene.
+    """
+    files = [Path(str(file)) for file in state.files]
+    for node in state.nodes:
+        texts = [value for _, value in node.props.items() if isinstance(value, str)]
+        found = [str(mi.file_resolver().resolve(text)) for text in texts]
+        files += [Path(file) for file in found if os.path.isfile(file)]
+    return files
+
+
+def instantiate(parsed: ParsedScene):
+    """Make Mitsuba's objects of a parsed scene, inside of ``search_beside``.
+
+    Raises:
+        UsageError: the file describes something that is not a scene, or an image is not whole.
+        RuntimeError: Mitsuba cannot make something.
+    """
+    config, state = parsed.config, parsed.state
+    _check_images(parsed.files)
+    mi.parser.transform_resolve(config, state)
+    if config.merge_equivalent:
+        mi.parser.transform_merge_equivalent(config, state)
+    if config.merge_meshes:
+        mi.parser.transform_merge_meshes(config, state)
+    scene = mi.parser.instantiate(config, state)
+    if not isinstance(scene, mi.Scene):
+        raise UsageError("the file holds no <scene>")
+    return scene
+
+
+def _check_images(files: list[Path]) -> None:
+    """Read all OpenEXR files once.
+
+    Where they cannot be read Mitsuba 3.9 ends the process, without an exception, if it happens to
+    read them in a thread of the pool that makes the scene.
+    """
+    for file in dict.fromkeys(files):
+        if file.suffix.lower() == ".exr":
+            try:
+                mi.Bitmap(str(file))
+            except RuntimeError as error:
+                raise UsageError(f"{file}: not a whole image ({one_line(error)})") from error
+
+
+class search_beside:
+    """Context in which Mitsuba looks for a scene's files in the folder of ``path`` first.
+
+    The folder is that of the path as given: a link to a scene elsewhere has its files beside it.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.folder = str(Path(os.path.abspath(path)).parent)
+
+    def __enter__(self) -> None:
+        self.before = mi.file_resolver()
+        resolver = type(self.before)(self.before)
+        resolver.prepend(self.folder)
+        mi.set_file_resolver(resolver)
+
+    def __exit__(self, *_) -> None:
+        mi.set_file_resolver(self.before)

@@ -1,0 +1,1 @@
+"""What is written for people and read again: images, and the names of their channels."""

@@ -1,0 +1,133 @@
+"""What a visitor meets first: README, its commands and links, and what lies at the top level."""
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from manylights.cli.main import parser
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+#: Pages with links that must lead somewhere.
+PAGES = (
+    *("README.md", "CHANGELOG.md", ".github/CONTRIBUTING.md", "plugins/README.md"),
+    *("scenes/README.md", "scenes/bench/README.md", "scenes/bench/more.md", "tests/README.md"),
+)
+
+
+def code_blocks(language):
+    """The blocks of the README in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.M | re.S)
+
+
+def commands(*programs):
+    """The commands of the README that call one of these programs, without comments."""
+    lines = re.findall(r"^    (\S.*)$", README, re.M) + re.findall(r"`([^`\n]+)`", README)
+    return [line.split("  #")[0].strip() for line in lines if line.split()[0] in programs]
+
+
+def test_readme_is_short():
+    lines = README.splitlines()
+    assert len(lines) <= 150
+    assert [line for line in lines if len(line) > 100] == []
+
+
+def test_commands_of_the_readme_are_understood():
+    found = [shlex.split(line)[1:] for line in commands("manylights")]
+    whole = [arguments for arguments in found if len(arguments) > 1 and "--help" not in arguments]
+    assert len(whole) >= 4
+    for arguments in whole:
+        parser().parse_args(arguments)
+    # In a sentence, without what follows
+    for name in {arguments[0] for arguments in found}:
+        with pytest.raises(SystemExit) as raised:
+            parser().parse_args([name, "--help"])
+        assert raised.value.code == 0
+
+
+def test_make_knows_the_goals_of_the_readme():
+    makefile = (ROOT / "Makefile").read_text()
+    goals = [line.split()[1] for line in commands("make") if " " in line]
+    assert "demo" in goals
+    for goal in goals:
+        assert re.search(rf"^{goal}:", makefile, re.M), goal
+
+
+def test_python_of_the_readme_renders(scalar, plugin, tmp_path, monkeypatch):
+    (text,) = code_blocks("python")
+    for old, new in (
+        ("llvm_ad_rgb", scalar),
+        ("10_000", "50, width=16, height=8"),
+        ("=16)", "=1)"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(text, "README.md", "exec"), {})
+    pixels = np.array(mi.Bitmap(str(tmp_path / "city.exr")))
+    assert np.isfinite(pixels).all() and pixels.shape[:2] == (8, 16)
+
+
+def test_xml_of_the_readme_loads(scalar, plugin):
+    (text,) = code_blocks("xml")
+    assert mi.load_string(text).integrator().class_name() == "ManyLightsDirect"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    path = ROOT / page
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        if re.match(r"https?://|mailto:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        linked = path.parent / name if name else path
+        assert linked.exists(), f"{page}: {target}"
+        assert not anchor or anchor in anchors(linked.read_text()), f"{page}: {target}"
+
+
+def anchors(text):
+    """The names that GitHub gives to headings."""
+    headings = re.findall(r"^#+ (.*)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+
+
+def table_rows(text):
+    """The rows of the tables of a page, as lists of cells."""
+    lines = (line for line in text.splitlines() if line.startswith("| "))
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_numbers_of_the_readme_are_those_measured():
+    """Of Mitsuba's methods in the report, of Cycles in what was measured by hand."""
+    measured = table_rows((ROOT / "scenes" / "bench" / "README.md").read_text())
+    by_hand = (ROOT / "scenes" / "bench" / "more.md").read_text()
+    rows = table_rows(README.partition("## When it helps")[2].partition("## ")[0])
+    assert len(rows) == 7
+    for _, lights, *mitsubas, cycles in rows[1:]:
+        numbers = [text for text in mitsubas if text[0].isdigit()]
+        cells = [lights, *numbers]
+        assert any(set(cells) <= set(row) for row in measured), cells
+        assert cycles == "-" or re.search(rf"\b{re.escape(cycles)}\b", by_hand), cycles
+
+
+def test_top_level_holds_only_rooms():
+    """What a reader sees first: folders of code, and the files that tools expect there."""
+    listed = subprocess.run(
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if listed.returncode != 0:
+        pytest.skip("not a checkout")
+    folders = {"plugins", "python", "scenes", "tests", "ext"}
+    files = {"README.md", "CHANGELOG.md", "LICENSE", "CITATION.cff"}
+    build = {"CMakeLists.txt", "Makefile", "pyproject.toml"}
+    top = {name.split("/")[0] for name in listed.stdout.split()}
+    assert {name for name in top if not name.startswith(".")} == folders | files | build

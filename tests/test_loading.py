@@ -1,0 +1,119 @@
+"""Loading: the reader follows from the file's name, and all go the same way from there."""
+
+import sys
+import types
+from pathlib import Path
+
+import manylights
+import numpy as np
+import pytest
+from manylights import loading
+from manylights.cli import main
+from manylights.errors import UsageError
+from manylights.lights import describe
+
+from tests.light_scenes import area, rgb, transform
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+
+class Stage(dict):
+    """What `manylights.usd.load` returns."""
+
+    notes = (types.SimpleNamespace(text="one light has a profile that is not read (/Lamp)"),)
+
+
+def stage():
+    """A floor and three lamps that can be merged, for a path tracer."""
+    place = transform().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(0.2)
+    lamp = {"type": "rectangle", "to_world": place, "emitter": area(rgb([3, 2, 1]))}
+    return Stage(
+        type="scene",
+        integrator={"type": "path", "max_depth": 3},
+        sensor={
+            "type": "perspective",
+            "to_world": transform().look_at([0, -4, 2], [0, 0, 0], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 8, "height": 8},
+        },
+        floor={"type": "rectangle"},
+        **{f"lamp_{index}": lamp for index in range(3)},
+    )
+
+
+@pytest.fixture
+def usd(monkeypatch, tmp_path):
+    """A reader of stages that notes its arguments; `path` is a file that it accepts."""
+    reader = types.ModuleType("manylights.usd")
+    reader.calls, reader.path = [], tmp_path / "stage.usda"
+    reader.path.write_text("#usda 1.0\n")
+
+    def load(path, **options):
+        reader.calls.append((path, options))
+        return stage()
+
+    reader.load = load
+    monkeypatch.setitem(sys.modules, "manylights.usd", reader)
+    monkeypatch.setattr(manylights, "usd", reader, raising=False)
+    return reader
+
+
+def test_a_stage_goes_the_same_way_as_xml(usd, scalar):
+    loaded = loading.load(str(usd.path), usd_options=loading.UsdOptions(camera="/Camera"))
+    ((path, options),) = usd.calls
+    assert path == str(usd.path)
+    assert options == {**vars(loading.UsdOptions()), "camera": "/Camera"}
+    assert loaded.notes[0] == Stage.notes[0].text
+    assert "path replaced by manylights_volpath" in loaded.notes[1]
+    assert loaded.notes[2] == "emitters: 3 meshes merged into 1"
+    assert loaded.files == [usd.path]
+    image = np.array(loaded.scene.integrator().render(loaded.scene, spp=4))
+    assert np.isfinite(image).all() and image.mean() > 0.0
+
+
+def test_layers_of_a_stage_are_among_its_files(usd, scalar, monkeypatch):
+    monkeypatch.setattr(Stage, "files", ["stage.usda", "lamps.usdc"], raising=False)
+    assert loading.load(str(usd.path)).files == [Path("stage.usda"), Path("lamps.usdc")]
+
+
+@pytest.mark.parametrize("ending", ["usd", "usda", "usdc", "usdz", "USDA"])
+def test_the_ending_chooses_the_reader(usd, scalar, tmp_path, ending):
+    path = tmp_path / f"other.{ending}"
+    path.write_text("")
+    assert describe(str(path))["kinds"] == {"area triangle": 6}
+
+
+def test_defaults_of_a_stage_are_refused(usd, scalar):
+    with pytest.raises(UsageError, match=r"-D spp: .*stage\.usda is USD, only XML has <default>"):
+        loading.load(str(usd.path), {"spp": "4"})
+
+
+def test_missing_usd_core_is_named(usd, monkeypatch, capsys, tmp_path):
+    monkeypatch.delattr(manylights, "usd")
+    monkeypatch.setitem(sys.modules, "manylights.usd", None)
+
+    class Finder:
+        """Finds the reader, which then misses pxr."""
+
+        def find_spec(self, name, *_):
+            if name == "manylights.usd":
+                raise ModuleNotFoundError("No module named 'pxr'", name="pxr")
+
+    monkeypatch.delitem(sys.modules, "manylights.usd")
+    monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
+    command = ["render", str(usd.path), "-o", str(tmp_path / "out.exr"), "--variant", "scalar_rgb"]
+    assert main(command) == 2
+    assert "pip install 'manylights[usd]'" in capsys.readouterr().err
+
+
+def test_files_are_looked_for_beside_a_link(scalar, tmp_path):
+    """The folder is that of the path as given, not of what it points to."""
+    shapes, links = tmp_path / "shapes", tmp_path / "links"
+    shapes.mkdir(), links.mkdir()
+    (shapes / "scene.xml").write_text(
+        '<scene version="3.0.0"><shape type="ply"><string name="filename" value="part.ply"/>'
+        "</shape></scene>"
+    )
+    triangle = Path(__file__).parents[1] / "scenes" / "data" / "triangle.ply"
+    (links / "part.ply").write_bytes(triangle.read_bytes())
+    (links / "scene.xml").symlink_to(shapes / "scene.xml")
+    assert links / "part.ply" in loading.load(str(links / "scene.xml")).files
