@@ -1,0 +1,197 @@
+"""Geometry that emits: mesh lights, geometry lights and materials that glow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+from pxr import UsdLux
+
+from manylights.usd.context import Context
+from manylights.usd.description import MeshShape, copied_faces, transformed, triangle_areas
+from manylights.usd.inputs import LightInputs
+from manylights.usd.lamps import Lamps, constant
+from manylights.usd.shaping import Cone
+from manylights.usd.surface import Surface
+
+#: Triangles that are handled at once, and that fit into memory.
+CHUNK, MOST_TRIANGLES = 2_000_000, 20_000_000
+
+#: Distance between the two sides of a double-sided light, over its size.
+THICKNESS = 1e-4
+
+
+@dataclass
+class Glow:
+    """What a surface emits.
+
+    Attributes:
+        radiance: three factors of the texture.
+        texture: a dictionary for Mitsuba, ``None`` for a constant radiance.
+        normalize: divide by the area of the whole prim in the world?
+        bsdf: a dictionary for Mitsuba, ``None`` if it does not reflect.
+        uses_uv: whether emission or reflection look up texture coordinates.
+    """
+
+    radiance: np.ndarray
+    texture: dict | None
+    normalize: bool
+    bsdf: dict | None
+    uses_uv: bool
+
+
+class MeshLight:
+    """A light on geometry, by an API schema or by a ``GeometryLight`` that points to it."""
+
+    def __init__(self, prim, context: Context, tints: bool) -> None:
+        self.inputs = inputs = LightInputs(prim, context)
+        self.context = context
+        value = inputs.radiance()
+        self.radiance = np.zeros(3) if value is None else value
+        self.normalize = bool(inputs.get("normalize"))
+        is_mesh_light = prim.HasAPI(UsdLux.MeshLightAPI)
+        usual = "materialGlowTintsLight" if is_mesh_light else "noMaterialResponse"
+        self.mode = inputs.own("light:materialSyncMode", usual) if tints else "noMaterialResponse"
+        inputs.note_unsupported()
+        if Cone.read(inputs, "mesh"):
+            context.notes.add("cone", "the cone of a mesh light was left out", prim)
+
+    def glow(self, surface: Surface, material) -> Glow:
+        """Return what a surface emits: the light's radiance, perhaps tinted by the material."""
+        bsdf = None if self.mode == "noMaterialResponse" else material.bsdf
+        tint, texture = np.ones(3), None
+        if self.mode == "materialGlowTintsLight":
+            if material.emission is None:
+                text = "the material of a mesh light does not glow, so it does not tint the light"
+                self.context.notes.add("tint", text, self.inputs.prim)
+            else:
+                tint, texture = constant_of(material.emission)
+        elif self.mode == "independent" and material.emission is not None:
+            text = "the material of a mesh light glows independently: only the light was read"
+            self.context.notes.add("tint", text, self.inputs.prim)
+        uses_uv = texture is not None or (bsdf is not None and material.uv_primvar is not None)
+        return Glow(self.radiance * tint, texture, self.normalize, bsdf, uses_uv)
+
+
+def glow_of(material) -> Glow | None:
+    """Return what a material emits by itself, None for nothing."""
+    if material.emission is None:
+        return None
+    radiance, texture = constant_of(material.emission)
+    if not radiance.any():
+        return None
+    return Glow(radiance, texture, False, material.bsdf, material.uv_primvar is not None)
+
+
+def constant_of(emission: dict) -> tuple[np.ndarray, dict | None]:
+    """Split an emission into factors and a texture, None if it is constant."""
+    if emission["type"] == "rgb":
+        value = np.array(emission["value"], dtype=np.float64)
+        value = np.broadcast_to(value, 3)
+        return np.maximum(np.where(np.isfinite(value), value, 0.0), 0.0), None
+    return np.ones(3), emission
+
+
+def world_areas(surfaces: list[Surface], worlds: np.ndarray) -> np.ndarray:
+    """Return the area of some surfaces together in each of their places, ``(n,)``."""
+    areas = np.zeros(len(worlds))
+    for surface in surfaces:
+        for chunk in chunks(len(worlds), len(surface.faces)):
+            positions = transformed(surface.positions, worlds[chunk])
+            areas[chunk] += triangle_areas(positions, surface.faces).sum(axis=1)
+    return areas
+
+
+def chunks(copies: int, triangles: int) -> list[slice]:
+    """Return slices of copies that have no more than ``CHUNK`` triangles, or one copy."""
+    step = max(CHUNK // max(triangles, 1), 1)
+    return [slice(begin, begin + step) for begin in range(0, copies, step)]
+
+
+def two_sided(surface: Surface) -> Surface:
+    """Return a surface with a copy that faces the other way, a little apart.
+
+    On coincident triangles chance would decide which side a ray meets.
+    """
+    points, faces = surface.positions.astype(np.float64), surface.faces.astype(np.int64)
+    normals = np.cross(
+        points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
+    )
+    sums = np.zeros_like(points)
+    for corner in range(3):
+        np.add.at(sums, faces[:, corner], normals)
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(float).tiny)
+    shift = 0.5 * THICKNESS * np.ptp(points, axis=0).max() * sums
+    uv = surface.uv
+    return Surface(
+        positions=np.concatenate([points + shift, points - shift]).astype(np.float32),
+        faces=np.concatenate([faces, faces[:, ::-1] + len(points)]).astype(np.uint32),
+        uv=None if uv is None else np.concatenate([uv, uv]),
+        binding=surface.binding,
+    )
+
+
+def add_lamps(lamps: Lamps, surface: Surface, glow: Glow, worlds, areas) -> list[MeshShape]:
+    """Add a surface in all its places; return the meshes that lamps cannot hold.
+
+    Args:
+        lamps: for what has a constant radiance and needs no texture coordinates.
+        surface: what emits.
+        glow: how.
+        worlds: ``(n, 4, 4)``.
+        areas: ``(n,)`` of the whole prim, to normalize by.
+    """
+    radiance = np.broadcast_to(glow.radiance, (len(worlds), 3))
+    if glow.normalize:
+        inverse = np.divide(1.0, areas, out=np.zeros_like(areas), where=areas > 0)
+        radiance = radiance * inverse[:, None]
+    if surface.double_sided:
+        surface = two_sided(surface)
+    if glow.uses_uv and surface.uv is not None:
+        return _with_uv(surface, glow, worlds, radiance)
+    if glow.texture is not None:
+        # Without texture coordinates a texture has one value
+        radiance = radiance * _mean(glow.texture)
+    for chunk in chunks(len(worlds), len(surface.faces)):
+        lamps.add(surface.positions, surface.faces, worlds[chunk], radiance[chunk], glow.bsdf)
+    return []
+
+
+def _with_uv(surface: Surface, glow: Glow, worlds, radiance) -> list[MeshShape]:
+    """Return a mesh for each radiance, with texture coordinates."""
+    values, which = np.unique(radiance.astype(np.float32), axis=0, return_inverse=True)
+    which = np.ravel(which)
+    result = []
+    for index, value in enumerate(values):
+        matrices = worlds[which == index]
+        faces = copied_faces(surface.faces.astype(np.int64), len(surface.positions), matrices)
+        positions = transformed(surface.positions, matrices).reshape(-1, 3)
+        uv = np.tile(surface.uv * (1, -1) + (0, 1), (len(matrices), 1))
+        emission = constant(value) if glow.texture is None else scaled(glow.texture, value)
+        mesh = MeshShape(positions.astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))
+        mesh.uv, mesh.bsdf, mesh.radiance = uv.astype(np.float32), glow.bsdf, emission
+        result.append(mesh)
+    return result
+
+
+def scaled(texture: dict, factors) -> dict:
+    """Return a ``bitmap`` texture times three factors."""
+    if np.all(np.asarray(factors) == 1):
+        return texture
+    pixels = (_pixels(texture) * np.asarray(factors)).astype(np.float32)
+    kept = {key: value for key, value in texture.items() if key not in ("filename", "bitmap")}
+    return {**kept, "raw": False, "bitmap": mi.Bitmap(pixels)}
+
+
+def _pixels(texture: dict) -> np.ndarray:
+    """Return the linear pixels of a ``bitmap`` texture."""
+    bitmap = texture["bitmap"] if "bitmap" in texture else mi.Bitmap(texture["filename"])
+    bitmap = mi.Bitmap(bitmap)
+    if texture.get("raw", False):
+        bitmap.set_srgb_gamma(False)
+    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+
+
+def _mean(texture: dict) -> np.ndarray:
+    return _pixels(texture).mean(axis=(0, 1))
