@@ -84,9 +84,8 @@ class LightInputs:
             return fallback
         if attribute.HasAuthoredConnections():
             sources = UsdShade.Utils.GetValueProducingAttributes(UsdShade.Input(attribute))
-            if sources and not UsdShade.Utils.GetType(sources[0].GetName()) == (
-                UsdShade.AttributeType.Output
-            ):
+            kinds = [UsdShade.Utils.GetType(source.GetName()) for source in sources]
+            if kinds and kinds[0] != UsdShade.AttributeType.Output:
                 attribute = sources[0]
             else:
                 text = f"inputs:{name} is connected to a shader and was left at its value"

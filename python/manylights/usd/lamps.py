@@ -19,7 +19,7 @@ SEPARATE_SPECTRA = 1000
 
 @dataclass
 class _Part:
-    """Triangles in the world and what each emits."""
+    """Copies of a mesh in the world: all triangles, and what each copy emits."""
 
     positions: np.ndarray
     faces: np.ndarray
@@ -56,11 +56,13 @@ class Lamps:
             factor = np.divide(areas, total, out=np.zeros_like(total), where=total > 0)
             radiances = radiances * factor[:, None]
         copies = copied_faces(faces, positions.shape[1], matrices)
+        if not len(matrices):
+            return
         self._parts.append(
             _Part(
                 positions.reshape(-1, 3).astype(np.float32),
                 copies.reshape(-1, 3),
-                np.repeat(radiances.astype(np.float32), len(faces), axis=0),
+                radiances.astype(np.float32),
                 bsdf,
             )
         )
@@ -73,30 +75,28 @@ class Lamps:
         return [mesh for parts in groups.values() for mesh in self._join(parts)]
 
     def _join(self, parts: list[_Part]) -> list[MeshShape]:
-        sizes = [len(part.positions) for part in parts]
-        begins = np.cumsum([0, *sizes[:-1]])
+        """Return the meshes of one BSDF: one for each radiance, or one for all."""
+        begins = np.cumsum([0, *(len(part.positions) for part in parts[:-1])])
         positions = np.concatenate([part.positions for part in parts])
         faces = np.concatenate([part.faces + begin for part, begin in zip(parts, begins)])
-        radiance = np.concatenate([part.radiance for part in parts])
-        lit = radiance.any(axis=1)
-        if not lit.all():
-            dark = _select(positions, faces[~lit], bsdf=parts[0].bsdf)
-            faces, radiance = faces[lit], radiance[lit]
-            rest = self._lit(positions, faces, radiance, parts[0].bsdf) if len(faces) else []
-            return [dark, *rest]
-        return self._lit(positions, faces, radiance, parts[0].bsdf)
-
-    def _lit(self, positions, faces, radiance, bsdf) -> list[MeshShape]:
-        values, which = _distinct(radiance)
+        faces = faces.astype(np.uint32)
+        copies = np.concatenate([part.radiance for part in parts])
+        sizes = [
+            np.full(len(part.radiance), len(part.faces) // len(part.radiance)) for part in parts
+        ]
+        values, which = _distinct(copies)
+        which = np.repeat(which, np.concatenate(sizes))
+        bsdf = parts[0].bsdf
         most = SEPARATE_SPECTRA if "spectral" in mi.variant() else SEPARATE_RADIANCES
+        if len(values) == 1:
+            return [MeshShape(positions, faces, bsdf=bsdf, radiance=constant(values[0]))]
         if len(values) <= most:
             return [
-                _select(positions, faces[which == index], bsdf=bsdf, radiance=constant(value))
+                _select(positions, faces[which == index], bsdf, constant(value))
                 for index, value in enumerate(values)
             ]
         self.uses_attribute = True
-        mesh = MeshShape(positions, faces.astype(np.uint32), bsdf=bsdf)
-        mesh.attributes["face_color"] = radiance
+        mesh = MeshShape(positions, faces, bsdf=bsdf, attributes={"face_color": values[which]})
         mesh.radiance = {"type": "mesh_attribute", "name": "face_color"}
         return [mesh]
 
@@ -116,7 +116,7 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rows[first], np.ravel(which)
 
 
-def _select(positions, faces, bsdf=None, radiance=None) -> MeshShape:
+def _select(positions, faces, bsdf, radiance) -> MeshShape:
     """Return a mesh of some of the faces, with the vertices that they use."""
     used, faces = np.unique(faces, return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.uint32)

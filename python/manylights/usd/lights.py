@@ -42,14 +42,16 @@ class Light:
     """All copies of one light of a kind.
 
     Attributes:
+        prim: the light.
         matrices: ``(n, 4, 4)`` to the world of its unit shape.
-        radiance: ``(n, 3)``.
-        areas: ``(n,)`` in the world.
+        radiance: three channels, if ``normalize`` times the area.
+        normalize: divide the radiance by the area?
     """
 
+    prim: Usd.Prim
     matrices: np.ndarray
     radiance: np.ndarray
-    areas: np.ndarray
+    normalize: bool
 
 
 class Lights:
@@ -95,39 +97,33 @@ class Lights:
 
     def _sphere(self, inputs: LightInputs, radiance, matrices) -> None:
         radius = inputs.length("radius")
-        as_point = bool(inputs.own("treatAsPoint", False))
         matrices = _scaled(matrices, radius, radius, radius)
-        areas = shapes.sphere_areas(matrices[:, :3, :3])
-        if radius == 0 or as_point:
-            self._point(inputs, radiance, matrices, areas, radius == 0)
-            return
-        self._area_light("sphere", inputs, radiance, matrices, areas)
+        if radius == 0 or inputs.own("treatAsPoint", False):
+            self._point(inputs, radiance, matrices, radius == 0)
+        else:
+            self._area_light("sphere", inputs, radiance, matrices)
 
     def _rect(self, inputs: LightInputs, radiance, matrices) -> None:
         matrices = _scaled(matrices, inputs.length("width"), inputs.length("height"), 1.0)
-        areas = shapes.flat_areas(matrices[:, :3, :3])
         image = None
         if inputs.file("texture:file"):
             image = read_image(inputs.file("texture:file"), inputs.prim, self.context)
         if image is None:
-            self._area_light("rect", inputs, radiance, matrices, areas)
+            self._area_light("rect", inputs, radiance, matrices)
         else:
-            self._pictures(inputs, radiance, matrices, areas, image)
+            self._pictures(inputs, radiance, matrices, image)
 
     def _disk(self, inputs: LightInputs, radiance, matrices) -> None:
         radius = inputs.length("radius")
-        matrices = _scaled(matrices, radius, radius, 1.0)
-        areas = np.pi * shapes.flat_areas(matrices[:, :3, :3])
-        self._area_light("disk", inputs, radiance, matrices, areas)
+        self._area_light("disk", inputs, radiance, _scaled(matrices, radius, radius, 1.0))
 
     def _cylinder(self, inputs: LightInputs, radiance, matrices) -> None:
         radius = inputs.length("radius")
-        matrices = _scaled(matrices, inputs.length("length"), radius, radius)
-        areas = shapes.tube_areas(matrices[:, :3, :3])
         if inputs.own("treatAsLine", False):
             text = "a light that is to be treated as a line keeps its radius"
             self.context.notes.add("treatAsLine", text, inputs.prim)
-        self._area_light("cylinder", inputs, radiance, matrices, areas)
+        matrices = _scaled(matrices, inputs.length("length"), radius, radius)
+        self._area_light("cylinder", inputs, radiance, matrices)
 
     def _distant(self, inputs: LightInputs, radiance, matrices) -> None:
         angle = float(inputs.get("angle"))
@@ -141,16 +137,15 @@ class Lights:
             self.context.notes.add("angle", text, inputs.prim)
         directions = -matrices[:, 2, :3]
         lengths = np.linalg.norm(directions, axis=1)
-        good = lengths > 0
-        self._note_lost(~good, inputs.prim)
+        good = self._good(lengths, [inputs.prim], [len(lengths)])
         for direction in directions[good] / lengths[good, None]:
             irradiance = constant(radiance * area)
-            self._emit("directional", direction=direction.tolist(), irradiance=irradiance)
-        self._shine(inputs.prim, radiance, int(good.sum()))
+            self.emit("directional", direction=direction.tolist(), irradiance=irradiance)
+        self._shine(radiance, int(good.sum()))
 
     def _dome(self, inputs: LightInputs, radiance, matrices) -> None:
         shining = self.domes.add(inputs, radiance, matrices)
-        self._shine(inputs.prim, radiance, shining)
+        self._shine(radiance, shining)
 
     def _portal(self, inputs: LightInputs, radiance, matrices) -> None:
         text = "portals only help to sample and were left out"
@@ -161,7 +156,7 @@ class Lights:
 
     # -- What they have in common
 
-    def _point(self, inputs: LightInputs, radiance, matrices, areas, no_radius: bool) -> None:
+    def _point(self, inputs: LightInputs, radiance, matrices, no_radius: bool) -> None:
         """Add a sphere without extent: intensity is radiance times projected area."""
         normalize = bool(inputs.get("normalize"))
         if no_radius and not normalize:
@@ -170,38 +165,41 @@ class Lights:
                 "the intensity of a point light"
             )
             self.context.notes.add("radius", text, inputs.prim)
-        share = 0.25 if normalize or no_radius else areas / 4
-        intensities = np.outer(np.broadcast_to(share, len(matrices)), radiance)
+        share = np.full(len(matrices), 0.25)
+        if not (normalize or no_radius):
+            share = shapes.sphere_areas(matrices[:, :3, :3]) / 4
+        intensities = np.outer(share, radiance)
         cone = shaping.Cone.read(inputs, "sphere")
         if cone:
-            shaping.add_spots(self, cone, "sphere", matrices, intensities)
+            shaping.add_spots(self, cone, "sphere", matrices, intensities, inputs.prim)
         else:
             for position, intensity in zip(matrices[:, 3, :3].tolist(), intensities):
-                self._emit("point", position=position, intensity=constant(intensity))
+                self.emit("point", position=position, intensity=constant(intensity))
         self._points.append(matrices[:, 3, :3])
-        self._shine(inputs.prim, radiance, len(matrices))
+        self._shine(radiance, len(matrices))
 
-    def _area_light(self, kind: str, inputs: LightInputs, radiance, matrices, areas) -> None:
+    def _area_light(self, kind: str, inputs: LightInputs, radiance, matrices) -> None:
         """Add a light with a surface that emits evenly."""
-        good = np.isfinite(areas) & (areas > 0)
-        self._note_lost(~good, inputs.prim)
-        matrices, areas = matrices[good], areas[good]
-        radiance = np.broadcast_to(radiance, (len(areas), 3))
-        if inputs.get("normalize"):
-            radiance = radiance / areas[:, None]
-        self._shine(inputs.prim, radiance, len(areas))
+        normalize = bool(inputs.get("normalize"))
         cone = shaping.Cone.read(inputs, kind)
-        if cone:
-            facing = areas / {"sphere": 4, "cylinder": np.pi}.get(kind, 1)
-            shaping.add_spots(self, cone, kind, matrices, radiance * facing[:, None])
-            self._points.append(matrices[:, 3, :3])
-        else:
-            self._kinds.setdefault(kind, []).append(Light(matrices, radiance, areas))
+        if cone is None:
+            light = Light(inputs.prim, matrices, radiance, normalize)
+            self._kinds.setdefault(kind, []).append(light)
+            return
+        areas = AREAS[kind](matrices[:, :3, :3])
+        good = self._good(areas, [inputs.prim], [len(areas)])
+        matrices, areas = matrices[good], areas[good]
+        facing = {"sphere": 1 / 4, "cylinder": 1 / np.pi}.get(kind, 1.0)
+        share = np.full(len(areas), facing) if normalize else areas * facing
+        intensities = np.outer(share, radiance)
+        shaping.add_spots(self, cone, kind, matrices, intensities, inputs.prim)
+        self._points.append(matrices[:, 3, :3])
+        self._shine(radiance, len(areas))
 
-    def _pictures(self, inputs: LightInputs, radiance, matrices, areas, image) -> None:
+    def _pictures(self, inputs: LightInputs, radiance, matrices, image) -> None:
         """Add rectangles that show a picture, from the front as it is in its file."""
-        good = np.isfinite(areas) & (areas > 0)
-        self._note_lost(~good, inputs.prim)
+        areas = AREAS["rect"](matrices[:, :3, :3])
+        good = self._good(areas, [inputs.prim], [len(areas)])
         if shaping.Cone.read(inputs, "rect"):
             text = "the cone of a light with a picture was left out"
             self.context.notes.add("cone", text, inputs.prim)
@@ -214,20 +212,25 @@ class Lights:
             to_world, mirrored = _facing(matrix)
             texture = {**textures[key], "to_uv": _unmirrored(mirrored)}
             emitter = {"type": "area", "radiance": texture}
-            self._emit("rectangle", to_world=to_world, emitter=emitter)
+            self.emit("rectangle", to_world=to_world, emitter=emitter)
         self._points.append(_corners(matrices[good]))
-        self._shine(inputs.prim, radiance, int(good.sum()))
+        self._shine(radiance, int(good.sum()))
 
-    def _note_lost(self, lost: np.ndarray, prim) -> None:
-        if lost.any():
+    def _good(self, areas: np.ndarray, prims: list, counts: list[int]) -> np.ndarray:
+        """Return which areas are finite and not zero, note those that are not."""
+        good = np.isfinite(areas) & (areas > 0)
+        if not good.all():
+            first = np.repeat(np.arange(len(prims)), counts)[~good][0]
             text = "a light with a zero or infinite area was left out"
-            self.context.notes.add("area", text, prim, int(lost.sum()))
+            self.context.notes.add("area", text, prims[first], int((~good).sum()))
+        return good
 
-    def _shine(self, prim, radiance, count: int) -> None:
+    def _shine(self, radiance, count: int) -> None:
         if np.any(radiance):
             self.count += count
 
-    def _emit(self, kind: str, **parameters) -> None:
+    def emit(self, kind: str, **parameters) -> None:
+        """Add a finished part of the description."""
         self.entries[f"light_{len(self.entries)}"] = {"type": kind, **parameters}
 
     # -- The end
@@ -240,21 +243,30 @@ class Lights:
     def finish(self, size: float) -> None:
         """Turn what was read into entries and lamps; ``size`` is that of the scene."""
         for kind, lights in self._kinds.items():
-            matrices = np.concatenate([light.matrices for light in lights])
-            radiance = np.concatenate([light.radiance for light in lights])
-            areas = np.concatenate([light.areas for light in lights])
-            lit = radiance.any(axis=1)
-            matrices, radiance, areas = matrices[lit], radiance[lit], areas[lit]
+            matrices, radiance, areas = self._joined(kind, lights)
             exact = EXACT[kind](matrices, size)
             most = MOST_FLAT if kind == "rect" else MOST_ROUND
             if exact.sum() > most:
                 exact[:] = False
             for matrix, value in zip(matrices[exact], radiance[exact]):
                 emitter = {"type": "area", "radiance": constant(value)}
-                self._emit(**SHAPES[kind](matrix), emitter=emitter)
+                self.emit(**SHAPES[kind](matrix), emitter=emitter)
             if not exact.all():
                 self._bake(kind, matrices[~exact], radiance[~exact], areas[~exact])
         self.entries.update(self.domes.finish())
+
+    def _joined(self, kind: str, lights: list[Light]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return matrices, radiances and areas of all lights of a kind that shine."""
+        counts = [len(light.matrices) for light in lights]
+        matrices = np.concatenate([light.matrices for light in lights])
+        radiance = np.repeat([light.radiance for light in lights], counts, axis=0)
+        areas = AREAS[kind](matrices[:, :3, :3])
+        good = self._good(areas, [light.prim for light in lights], counts)
+        divided = good & np.repeat([light.normalize for light in lights], counts)
+        radiance[divided] /= areas[divided, None]
+        good &= radiance.any(axis=1)
+        self.count += int(good.sum())
+        return matrices[good], radiance[good], areas[good]
 
     def _bake(self, kind: str, matrices, radiance, areas) -> None:
         """Turn lights into triangles."""
@@ -374,6 +386,16 @@ def _round(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return difference <= shapes.ROUNDING * square
 
 
+def _disk_areas(linear: np.ndarray) -> np.ndarray:
+    return np.pi * shapes.flat_areas(linear)
+
+
+AREAS = {
+    "sphere": shapes.sphere_areas,
+    "rect": shapes.flat_areas,
+    "disk": _disk_areas,
+    "cylinder": shapes.tube_areas,
+}
 EXACT = {
     "sphere": _exact_spheres,
     "rect": _exact_rects,

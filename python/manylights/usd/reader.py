@@ -33,8 +33,17 @@ class SceneDict(dict):
     metadata: dict
 
 
-def load(path, *, time=None, camera=None, purposes=("default", "render"), subdivision=None,
-         default_light=False, legacy_lights=False, blender_light_units=False) -> SceneDict:  # fmt: skip
+def load(
+    path,
+    *,
+    time=None,
+    camera=None,
+    purposes=("default", "render"),
+    subdivision=None,
+    default_light=False,
+    legacy_lights=False,
+    blender_light_units=False,
+) -> SceneDict:
     """Read a USD stage as a dictionary for ``mi.load_dict``.
 
     Lengths stay in units of the stage and axes as they are; radiance is in nits. Lamps that are
@@ -63,25 +72,44 @@ def load(path, *, time=None, camera=None, purposes=("default", "render"), subdiv
             the text names file and prim.
     """
     description = describe(
-        path, time=time, camera=camera, purposes=purposes, subdivision=subdivision,
-        default_light=default_light, legacy_lights=legacy_lights,
+        path,
+        time=time,
+        camera=camera,
+        purposes=purposes,
+        subdivision=subdivision,
+        default_light=default_light,
+        legacy_lights=legacy_lights,
         blender_light_units=blender_light_units,
-    )  # fmt: skip
+    )
     result = SceneDict(instantiate(description))
     result.__dict__.update(description.__dict__)
     return result
 
 
-def describe(path, *, time=None, camera=None, purposes=("default", "render"), subdivision=None,
-             default_light=False, legacy_lights=False, blender_light_units=False) -> SceneDict:  # fmt: skip
-    """Read a stage as :func:`load` does, with each mesh as a ``MeshShape`` in place of an object."""
+def describe(
+    path,
+    *,
+    time=None,
+    camera=None,
+    purposes=("default", "render"),
+    subdivision=None,
+    default_light=False,
+    legacy_lights=False,
+    blender_light_units=False,
+) -> SceneDict:
+    """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet."""
     notes = Notes()
     stage = open_stage(path, notes)
     delegate = quiet()
     context = Context(
-        stage, time_of(stage, time), notes, tuple(purposes), subdivision, legacy_lights,
-        blender_light_units,
-    )  # fmt: skip
+        stage=stage,
+        time=time_of(stage, time),
+        notes=notes,
+        purposes=tuple(purposes),
+        subdivision=subdivision,
+        legacy_lights=legacy_lights,
+        blender_light_units=blender_light_units,
+    )
     _bake_skinning(context)
     batches = collect(context)
     lights = Lights(context)

@@ -80,7 +80,7 @@ class Cone:
         return (1.0 - x * x * (3.0 - 2.0 * x)) * np.abs(np.cos(theta)) ** self.focus
 
 
-def add_spots(lights, cone: Cone, kind: str, matrices, intensities) -> None:
+def add_spots(lights, cone: Cone, kind: str, matrices, intensities, prim) -> None:
     """Add spot lights in the places of lights with a cone.
 
     Args:
@@ -89,6 +89,7 @@ def add_spots(lights, cone: Cone, kind: str, matrices, intensities) -> None:
         kind: of light.
         matrices: ``(n, 4, 4)`` of their unit shapes.
         intensities: ``(n, 3)`` along the axis, or for cylinders across theirs.
+        prim: the light, for notes.
     """
     places = _places(kind) if len(matrices) <= FEW_LIGHTS else np.zeros((1, 3))
     count = len(places) * len(matrices)
@@ -112,14 +113,14 @@ def add_spots(lights, cone: Cone, kind: str, matrices, intensities) -> None:
             }
             if texture is not None:
                 spot["texture"] = {"type": "ref", "id": name}
-            lights._emit("spot", **spot)
-    _note(lights, kind, count, needed and texture is None)
+            lights.emit("spot", **spot)
+    _note(lights, kind, len(matrices), needed and texture is None, prim)
 
 
-def _note(lights, kind: str, count: int, rough: bool) -> None:
+def _note(lights, kind: str, count: int, rough: bool, prim) -> None:
     edge = ", with another falloff" if rough else ""
     text = f"{kind} lights with a cone became spots, which have no size and are not seen{edge}"
-    lights.context.notes.add("cone", text, "/", count)
+    lights.context.notes.add("cone", text, prim, count)
 
 
 def _places(kind: str) -> np.ndarray:

@@ -84,7 +84,7 @@ def _note_composition(stage: Usd.Stage, path: str, notes: Notes) -> None:
         if "Cycle" in name:
             notes.add("cycle", f"a cycle in the composition was cut: {text}", where)
         elif asset and name in ("ErrorInvalidAssetPath", "ErrorInvalidSublayerPath"):
-            reason = text.partition(" -- ")[2].rstrip("; skipping.")
+            reason = text.partition(" -- ")[2].removesuffix("skipping.").rstrip("; ")
             missing.setdefault(asset[1], [where, 0, reason])[1] += 1
         else:
             notes.add("composition", f"a part of the stage does not compose: {text}", where)

@@ -1,6 +1,6 @@
 """Small meshes of the shapes that lights have, and the exact areas of these shapes.
 
-All are in the space of the light and face where it emits; all functions take row vectors, ``p @ M``.
+All are in the space of the light and face where it emits. Points are row vectors, ``p @ M``.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ def tube(segments: int) -> tuple[np.ndarray, np.ndarray]:
     a = np.arange(segments)
     b, c, d = (a + 1) % segments, a + segments, (a + 1) % segments + segments
     faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
-    points = np.concatenate([ring - (0.5, 0, 0), ring + (0.5, 0, 0)])
+    half = np.array([0.5, 0, 0])
+    points = np.concatenate([ring - half, ring + half])
     # The winding that faces outwards
     corner = points[faces[0]]
     if np.dot(np.cross(corner[1] - corner[0], corner[2] - corner[0]), corner.mean(axis=0)) < 0:
