@@ -72,9 +72,13 @@ class Context:
         """
         if not attribute:
             return fallback
-        value = attribute.Get(self.time)
-        if value is None and self.time.IsDefault() and attribute.GetNumTimeSamples():
-            value = attribute.Get(Usd.TimeCode.EarliestTime())
+        time = self.time
+        if time.IsDefault() and attribute.GetNumTimeSamples():
+            # Without an authored default, Get would give the schema's fallback
+            source = attribute.GetResolveInfo(time).GetSource()
+            if source in (Usd.ResolveInfoSourceFallback, Usd.ResolveInfoSourceNone):
+                time = Usd.TimeCode.EarliestTime()
+        value = attribute.Get(time)
         return fallback if value is None else value
 
     def __post_init__(self) -> None:

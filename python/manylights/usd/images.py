@@ -26,10 +26,21 @@ class Image:
     pixels: np.ndarray
     name: str
 
-    def texture(self, scale) -> dict:
+    def texture(self, scale, to_uv) -> dict:
         """Return the picture times three factors as a texture of radiance."""
-        pixels = (self.pixels * np.asarray(scale)).astype(np.float32)
-        return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "wrap_mode": "clamp"}
+        return emissive(self.pixels * np.asarray(scale), wrap_mode="clamp", to_uv=to_uv)
+
+
+def emissive(pixels: np.ndarray, **parameters) -> dict:
+    """Return linear pixels as a texture of radiance; ``parameters`` are those of a ``bitmap``.
+
+    Mitsuba's ``bitmap`` has reflectances in spectral variants: above 1 it cuts them off.
+    """
+    spectral = "spectral" in mi.variant()
+    peak = max(float(pixels.max()), np.finfo(np.float32).tiny) if spectral else 1.0
+    bitmap = mi.Bitmap((pixels / peak).astype(np.float32))
+    texture = {"type": "bitmap", "bitmap": bitmap, "raw": not spectral, **parameters}
+    return {"type": "d65", "nested": texture, "scale": peak} if spectral else texture
 
 
 def read_image(asset: Sdf.AssetPath, prim: Usd.Prim, context: Context) -> Image | None:

@@ -206,12 +206,11 @@ class Lights:
         textures = {}
         for matrix, area in zip(matrices[good], areas[good]):
             scale = radiance / (area if inputs.get("normalize") else 1.0)
-            key = tuple(scale)
-            if key not in textures:
-                textures[key] = image.texture(scale)
             to_world, mirrored = _facing(matrix)
-            texture = {**textures[key], "to_uv": _unmirrored(mirrored)}
-            emitter = {"type": "area", "radiance": texture}
+            key = (*scale, mirrored)
+            if key not in textures:
+                textures[key] = image.texture(scale, _unmirrored(mirrored))
+            emitter = {"type": "area", "radiance": textures[key]}
             self.emit("rectangle", to_world=to_world, emitter=emitter)
         self._points.append(_corners(matrices[good]))
         self._shine(radiance, int(good.sum()))

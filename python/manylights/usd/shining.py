@@ -10,6 +10,7 @@ from pxr import UsdLux
 
 from manylights.usd.context import Context
 from manylights.usd.description import MeshShape, copied_faces, transformed, triangle_areas
+from manylights.usd.images import emissive
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
 from manylights.usd.shaping import Cone
@@ -176,12 +177,10 @@ def _with_uv(surface: Surface, glow: Glow, worlds, radiance) -> list[MeshShape]:
 
 
 def scaled(texture: dict, factors) -> dict:
-    """Return a ``bitmap`` texture times three factors."""
-    if np.all(np.asarray(factors) == 1):
-        return texture
-    pixels = (_pixels(texture) * np.asarray(factors)).astype(np.float32)
-    kept = {key: value for key, value in texture.items() if key not in ("filename", "bitmap")}
-    return {**kept, "raw": False, "bitmap": mi.Bitmap(pixels)}
+    """Return a ``bitmap`` texture of radiance times three factors."""
+    own = ("type", "filename", "bitmap", "raw")
+    kept = {key: value for key, value in texture.items() if key not in own}
+    return emissive(_pixels(texture) * np.asarray(factors), **kept)
 
 
 def _pixels(texture: dict) -> np.ndarray:
