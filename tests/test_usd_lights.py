@@ -336,9 +336,9 @@ def test_several_domes_are_their_sum(load, tmp_path):
     text = f'def DomeLight "a" {{;{file}}};def DomeLight "b" {{;{file}{placed(turn=90)}}};'
     scene = load(text + 'def DomeLight "c" {;color3f inputs:color = (0.5, 0.25, 0);}')
     plain = np.array([0.5, 0.25, 0])
-    assert background(scene, (0, 0, 1)) == pytest.approx(plain + (1, 0, 0), abs=0.02)
-    assert background(scene, (0, -1, 0)) == pytest.approx(plain + (1, 0, 0), abs=0.02)
-    assert background(scene, (1, 0, 0)) == pytest.approx(plain + (0, 0, 2), abs=0.02)
+    assert background(scene, (0, 0, 1)) == pytest.approx(plain + np.array((1, 0, 0)), abs=0.02)
+    assert background(scene, (0, -1, 0)) == pytest.approx(plain + np.array((1, 0, 0)), abs=0.02)
+    assert background(scene, (1, 0, 0)) == pytest.approx(plain + np.array((0, 0, 2)), abs=0.02)
     assert "3" in note(scene, "domes")
 
 

@@ -19,7 +19,7 @@ def write_stage(folder, text, name="stage.usda", **metadata):
              for key, value in metadata.items()]  # fmt: skip
     header = "(\n" + "\n".join(lines) + "\n)\n" if lines else ""
     path = folder / name
-    path.write_text("#usda 1.0\n" + header + text.replace(";", "\n"))
+    path.write_text("#usda 1.0\n" + header + text.replace(";", "\n").replace("}", "\n}\n"))
     return path
 
 

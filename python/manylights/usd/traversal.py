@@ -243,6 +243,11 @@ class _Traversal:
             text = f"a PointInstancer with {len(indices)} protoIndices has arrays of other sizes"
             notes.add("instancer", f"{text}: left out", prim)
             return none
+        for attribute in (instancer.GetScalesAttr(), instancer.GetOrientationsAttr()):
+            values = self.context.value(attribute)
+            if values is not None and len(values) not in (0, len(indices)):
+                text = f"a PointInstancer with {len(indices)} protoIndices has {len(values)}"
+                notes.add("instancer", f"{text} {attribute.GetName()}, which were ignored", prim)
         keep = mask if len(mask) else np.ones(len(indices), dtype=bool)
         bad = (indices < 0) | (indices >= prototypes) | ~np.isfinite(matrices).all(axis=(1, 2))
         if (bad & keep).any():
