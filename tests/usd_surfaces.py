@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mitsuba as mi
 import numpy as np
 from manylights.usd.context import Context
@@ -9,6 +11,8 @@ from manylights.usd.geometry import surfaces_of
 from manylights.usd.materials import Materials
 from manylights.usd.mitsuba_meshes import mesh_of
 from pxr import Usd
+
+_numbers = itertools.count()
 
 SQUARE = """
     int[] faceVertexCounts = [4]
@@ -19,12 +23,13 @@ SQUARE = """
 
 
 def stage_of(text, folder=None):
-    """Return a stage of the text of a .usda file; with a folder, saved there as stage.usda."""
+    """Return a stage of the text of a .usda file; with a folder, saved there."""
     if folder is None:
         stage = Usd.Stage.CreateInMemory()
         stage.GetRootLayer().ImportFromString("#usda 1.0\n" + text)
         return stage
-    path = folder / "stage.usda"
+    # OpenUSD keeps layers by their path while a stage uses them
+    path = folder / f"stage{next(_numbers)}.usda"
     path.write_text("#usda 1.0\n" + text)
     return Usd.Stage.Open(str(path))
 
@@ -117,7 +122,8 @@ def picture(stage, size=16, from_z=1, light=1.0, lights=None, **choices):
     turn = mi.ScalarTransform4f().look_at(origin=[0, 0, 5 * from_z], target=[0, 0, 0], up=[0, 1, 0])
     scene = {
         "type": "scene",
-        "integrator": {"type": "path", "max_depth": 2},
+        # Without lamps directions of the BSDF alone, which are exact for a diffuse one
+        "integrator": {"type": "direct", "emitter_samples": int(lights is not None)},
         "sensor": {
             "type": "orthographic",
             "to_world": turn,

@@ -89,7 +89,9 @@ class Principled:
         self._set_reflectance(bsdf, look)
         if bsdf["clearcoat"] != 0.0:
             bsdf["clearcoat_gloss"] = self._gloss(look.clearcoat_roughness)
-        bsdf = {name: value for name, value in bsdf.items() if value != 0.0 or name == "roughness"}
+        for name in ("metallic", "clearcoat"):
+            if bsdf[name] == 0.0:
+                del bsdf[name]  # without the lobe the kernel is smaller
         if isinstance(look.normal, Lookup):
             normals = self.textures.make(look.normal, "normal")
             if isinstance(normals, dict):
