@@ -9,7 +9,7 @@ from pxr import UsdGeom, UsdShade
 
 from manylights.usd import primvars
 from manylights.usd.primvars import PER_POINT, Sizes, Values
-from manylights.usd.subdivision import Cage, levels_of, refine
+from manylights.usd.subdivision import cage_of, levels_of, refine
 from manylights.usd.surface import Surface
 from manylights.usd.triangulation import triangulate
 
@@ -152,7 +152,7 @@ def _refined(mesh, polygons: Polygons, context) -> Polygons:
     scheme, levels = levels_of(mesh, len(polygons.counts), context)
     if not levels:
         return polygons
-    return refine(polygons, Cage.of(mesh, scheme, context), levels)
+    return refine(polygons, cage_of(mesh, scheme, context), levels)
 
 
 def _cut(mesh, polygons: Polygons, holes: np.ndarray, context) -> Surface:
