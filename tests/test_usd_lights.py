@@ -126,7 +126,7 @@ def test_lengths_that_are_not_authored_are_those_of_the_schema(load):
     assert color(light["emitter"]["radiance"]) == pytest.approx([1 / np.pi] * 3)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     st.lists(st.floats(-2, 2), min_size=9, max_size=9),
     st.sampled_from(sorted(SURFACES)),
@@ -488,7 +488,7 @@ def mesh_light(inputs, bound=True, api="MeshLightAPI"):
     return f'{GLOW};def Mesh "quad" {apis} {{;{QUAD}{inputs}{BOUND if bound else ""}}}'
 
 
-def per_area(text):
+def per_area():
     """Return the irradiance of a quad of radiance 1, five above the floor."""
     return seen(SURFACES["RectLight"](row_matrix(np.eye(3))))
 
@@ -504,7 +504,7 @@ def per_area(text):
 )
 def test_mesh_light_has_one_emission(load, inputs, bound, expected):
     scene = load(mesh_light(inputs + placed(), bound))
-    assert_irradiance(scene, per_area("") * np.array(expected, dtype=float))
+    assert_irradiance(scene, per_area() * np.array(expected, dtype=float))
     assert bool(note(scene, "tint")) != bound
 
 
@@ -520,21 +520,21 @@ def test_back_of_a_mesh_light_shines_if_it_is_double_sided(load, double):
     flag = "uniform bool doubleSided = true;" if double else ""
     scene = load(mesh_light(placed(turn=180) + flag, bound=False))
     if double:
-        assert_irradiance(scene, per_area(""), rounding=0.002)
+        assert_irradiance(scene, per_area(), rounding=0.002)
     else:
         assert irradiance(scene, spp=4, seeds=range(1)).max() == 0
 
 
 def test_glowing_material_shines_without_a_light(load):
     scene = load(f'{GLOW};def Mesh "quad" {{;{QUAD}{BOUND}{placed()}}}')
-    assert_irradiance(scene, per_area("") * np.array([1, 0.5, 0.25]))
+    assert_irradiance(scene, per_area() * np.array([1, 0.5, 0.25]))
     assert not note(scene, "no light")
 
 
 def test_geometry_light_makes_its_geometry_shine(load):
     light = 'def GeometryLight "light" {;rel geometry = </quad>;float inputs:intensity = 6;}'
     scene = load(f'{light};def Mesh "quad" {{;{QUAD}{placed()}}}')
-    assert_irradiance(scene, 6 * per_area(""))
+    assert_irradiance(scene, 6 * per_area())
     assert "/none" in note(load(light.replace("/quad", "/none")), "geometry light")
 
 
@@ -585,3 +585,31 @@ def test_light_without_area_is_noted(load, kind):
     scene = load(f'def {kind} "light" {{;{lengths}bool inputs:normalize = true;}}')
     assert "/light" in note(scene, "area")
     assert note(scene, "no light")
+
+
+def test_mesh_light_keeps_the_colors_that_it_reflects(load):
+    """A tinted light without a material reflects with its displayColor."""
+    more = 'color3f[] primvars:displayColor = [(0.2, 0.4, 0.6)] (interpolation = "constant");'
+    scene = load(mesh_light(placed() + more, bound=False))
+    assert_irradiance(scene, per_area())
+
+
+def test_emissive_picture(load, tmp_path):
+    """A picture of four quarters on a mesh, with texture coordinates: its mean lights the floor."""
+    pixels = np.repeat(np.repeat(QUARTERS, 8, axis=0), 8, axis=1)
+    write_map(tmp_path, "quarters.exr", pixels)
+    glow = """def Material "glow" { ; token outputs:surface.connect = </glow/shader.outputs:surface>
+        def Shader "shader" { ; uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:emissiveColor.connect = </glow/image.outputs:rgb>
+            color3f inputs:diffuseColor = (0, 0, 0); token outputs:surface; }
+        def Shader "image" { ; uniform token info:id = "UsdUVTexture"
+            asset inputs:file = @quarters.exr@; float3 outputs:rgb
+            float2 inputs:st.connect = </glow/st.outputs:result>; }
+        def Shader "st" { ; uniform token info:id = "UsdPrimvarReader_float2"
+            string inputs:varname = "st"; float2 outputs:result; } };"""
+    st = "texCoord2f[] primvars:st = [(1, 1), (0, 1), (0, 0), (1, 0)]"
+    st += ' (interpolation = "vertex");'
+    quad = QUAD.replace("0.5", "0.005")
+    scene = load(f'{glow};def Mesh "quad" {{;{quad}{st}{BOUND}{placed(z=0.5)}}}')
+    expected = 1e-4 / 0.25 * QUARTERS.mean(axis=(0, 1))
+    assert_irradiance(scene, expected, rounding=0.005, size=0.001)

@@ -8,8 +8,12 @@ import numpy as np
 from pxr import Tf, Usd, UsdLux
 
 from manylights.usd.context import Context
-from manylights.usd.description import MeshShape, copied_faces, transformed
+from manylights.usd.copies import copies
+from manylights.usd.description import transformed
+from manylights.usd.geometry import surfaces_of
 from manylights.usd.lights import Lights, transform
+from manylights.usd.materials import Materials
+from manylights.usd.mitsuba_meshes import checked_uv
 from manylights.usd.shining import MOST_TRIANGLES, Glow, MeshLight, add_lamps, glow_of, world_areas
 from manylights.usd.surface import Surface
 from manylights.usd.traversal import Batch, Item
@@ -26,10 +30,8 @@ class Drawing:
     """
 
     def __init__(self, context: Context, lights: Lights, batches: list[Batch]) -> None:
-        from manylights.usd import materials
-
         self.context, self.lights = context, lights
-        self.materials = materials.Materials(context)
+        self.materials = Materials(context)
         self.entries: dict[str, object] = {}
         self._corners: list[np.ndarray] = []
         self._pointed = _geometry_lights(context, batches)
@@ -48,7 +50,7 @@ class Drawing:
                 self.context.notes.add("geometry", text, item.prim)
         if len(batch.transforms) == 1:
             for item, surface, material in quiet:
-                self._enter(item.prim, _mesh(surface, material, batch.worlds(item)))
+                self._enter(item.prim, copies(surface, material.bsdf, batch.worlds(item)))
         elif quiet:
             self._add_instances(batch, quiet)
 
@@ -68,9 +70,7 @@ class Drawing:
 
     def _add_shining(self, batch: Batch, item: Item) -> list[tuple[Item, Surface, object]]:
         """Add the surfaces of a prim that shine, return the others with their materials."""
-        from manylights.usd import geometry
-
-        surfaces = geometry.surfaces_of(item.prim, self.context)
+        surfaces = surfaces_of(item.prim, self.context)
         surfaces = [surface for surface in surfaces if len(surface.faces)]
         if not surfaces:
             return []
@@ -79,9 +79,9 @@ class Drawing:
         light = self._light(item.prim)
         quiet, shining = [], []
         for surface in surfaces:
-            material = self.materials.bsdf(surface.binding or item.prim)
-            _choose_uv(surface, material)
-            glow = light.glow(surface, material) if light else glow_of(material)
+            material = self.materials.of(surface)
+            surface.uv = checked_uv(surface, material, self.context)
+            glow = light.glow(surface, material) if light else glow_of(surface, material)
             if glow is None or not glow.radiance.any():
                 quiet.append((item, surface, material))
             else:
@@ -122,11 +122,11 @@ class Drawing:
         triangles = sum(len(surface.faces) for _, surface, _ in quiet)
         if len(transforms) > MANY_COPIES and triangles * len(transforms) <= BAKED_TRIANGLES:
             for item, surface, material in quiet:
-                self._enter(item.prim, _mesh(surface, material, item.local @ transforms))
+                self._enter(item.prim, copies(surface, material.bsdf, item.local @ transforms))
             return
         group = {"type": "shapegroup"}
         for index, (item, surface, material) in enumerate(quiet):
-            group[f"shape_{index}"] = _mesh(surface, material, item.local[None])
+            group[f"shape_{index}"] = copies(surface, material.bsdf, item.local[None])
         name = self._enter(first, group)
         for index, matrix in enumerate(transforms):
             self.entries[f"{name}_instance_{index}"] = {
@@ -151,42 +151,6 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
             text = f"a GeometryLight points to {target}, which is not drawn"
             context.notes.add("geometry light", text, prim)
     return result
-
-
-def _choose_uv(surface: Surface, material) -> None:
-    """Use the texture coordinates that the material asks for, if the surface has them."""
-    chosen = surface.uv_sets.get(material.uv_primvar) if material.uv_primvar else None
-    if chosen is not None:
-        surface.uv = chosen
-
-
-def _mesh(surface: Surface, material, matrices: np.ndarray) -> MeshShape:
-    """Return copies of a surface as one mesh in the space that the matrices lead to."""
-    count, vertices = len(matrices), len(surface.positions)
-    faces = copied_faces(surface.faces.astype(np.int64), vertices, matrices).reshape(-1, 3)
-    positions = transformed(surface.positions, matrices).reshape(-1, 3)
-    mesh = MeshShape(positions.astype(np.float32), faces.astype(np.uint32), bsdf=material.bsdf)
-    if surface.normals is not None:
-        mesh.normals = _normals(surface.normals, matrices)
-    if surface.uv is not None:
-        mesh.uv = np.tile(surface.uv * (1, -1) + (0, 1), (count, 1)).astype(np.float32)
-    for name, rows in (("color", surface.colors), ("opacity", surface.opacity)):
-        if rows is not None:
-            per = getattr(surface, "colors_per" if name == "color" else "opacity_per")
-            mesh.attributes[f"{per}_{name}"] = np.tile(rows, (count, 1))
-    return mesh
-
-
-def _normals(normals: np.ndarray, matrices: np.ndarray) -> np.ndarray:
-    """Return the normals of copies, on the outside also where a matrix mirrors."""
-    linear = matrices[:, :3, :3]
-    # The cofactors are the inverse transposed times the determinant, and exist without it
-    x, y, z = (linear[:, row] for row in range(3))
-    cofactors = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
-    cofactors *= np.where(np.linalg.det(linear) < 0, -1.0, 1.0)[:, None, None]
-    result = (normals @ cofactors).reshape(-1, 3)
-    lengths = np.linalg.norm(result, axis=1, keepdims=True)
-    return (result / np.maximum(lengths, np.finfo(float).tiny)).astype(np.float32)
 
 
 def _box(positions: np.ndarray, matrices: np.ndarray) -> np.ndarray:

@@ -1,31 +1,34 @@
-"""Meshes as fans of triangles; other prims of geometry have no surfaces yet."""
+"""Prims of geometry as surfaces, whatever their type."""
 
 from __future__ import annotations
 
-import numpy as np
-from pxr import UsdGeom
-
+from manylights.usd.curves import surfaces_of_curves
+from manylights.usd.gprims import SHAPES, surfaces_of_gprim, surfaces_of_points
+from manylights.usd.meshes import surfaces_of_mesh
 from manylights.usd.surface import Surface
+from manylights.usd.tetrahedra import surfaces_of_tetrahedra
+
+READERS = {
+    "Mesh": surfaces_of_mesh,
+    "Points": surfaces_of_points,
+    "BasisCurves": surfaces_of_curves,
+    "TetMesh": surfaces_of_tetrahedra,
+    **dict.fromkeys(SHAPES, surfaces_of_gprim),
+}
+
+NOT_CARRIED = ("NurbsPatch", "NurbsCurves", "HermiteCurves", "Volume")
+"""Types that draw something and that are left out, with a note."""
 
 
 def surfaces_of(prim, context) -> list[Surface]:
-    """Return the surface of a mesh."""
-    mesh = UsdGeom.Mesh(prim)
-    if not mesh:
-        return []
-    points = context.value(mesh.GetPointsAttr())
-    counts = context.value(mesh.GetFaceVertexCountsAttr())
-    indices = context.value(mesh.GetFaceVertexIndicesAttr())
-    if not points or not counts or not indices:
-        return []
-    indices, faces, begin = np.array(indices), [], 0
-    for count in counts:
-        corners = indices[begin : begin + count]
-        faces += [(corners[0], corners[i], corners[i + 1]) for i in range(1, count - 1)]
-        begin += count
-    faces = np.array(faces, dtype=np.uint32)
-    if context.value(mesh.GetOrientationAttr()) == "leftHanded":
-        faces = faces[:, ::-1]
-    double = bool(context.value(mesh.GetDoubleSidedAttr(), False))
-    positions = np.array(points, dtype=np.float32)
-    return [Surface(positions, faces, double_sided=double, binding=prim)]
+    """Return the surfaces of a prim, in its own space: one for each material it is bound to.
+
+    Prims of other types, and broken ones, have none; the latter are noted.
+    """
+    kind = str(prim.GetTypeName())
+    reader = READERS.get(kind)
+    if reader is not None:
+        return reader(prim, context)
+    if kind in NOT_CARRIED:
+        context.notes.add(kind, f"prims of type {kind} are left out", prim)
+    return []

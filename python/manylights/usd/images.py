@@ -72,7 +72,10 @@ def _bitmap(path: str) -> mi.Bitmap:
         raise ValueError("is not in its archive")
     with asset:
         data = bytes(asset.GetBuffer())
-    return mi.Bitmap(mi.MemoryStream(data))
+    stream = mi.MemoryStream()
+    stream.write(data)
+    stream.seek(0)
+    return mi.Bitmap(stream)
 
 
 def _linear(bitmap: mi.Bitmap) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from manylights.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
-from manylights.usd import cameras
+from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
 from manylights.usd.description import instantiate
 from manylights.usd.drawing import Drawing
@@ -110,7 +110,7 @@ def describe(
         legacy_lights=legacy_lights,
         blender_light_units=blender_light_units,
     )
-    _bake_skinning(context)
+    skinning.bake(context)
     batches = collect(context)
     lights = Lights(context)
     drawing = Drawing(context, lights, batches)
@@ -188,13 +188,3 @@ def _metadata(context: Context) -> dict:
         "upAxis": str(UsdGeom.GetStageUpAxis(context.stage)),
         "time": None if time.IsDefault() else float(time.GetValue()),
     }
-
-
-def _bake_skinning(context: Context) -> None:
-    """Pose skinned meshes, if there are any."""
-    from pxr import UsdSkel
-
-    if any(prim.IsA(UsdSkel.Root) for prim in context.stage.Traverse()):
-        from manylights.usd import skinning
-
-        skinning.bake(context.stage)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
 from pxr import UsdLux
 
 from manylights.usd.context import Context
-from manylights.usd.description import MeshShape, copied_faces, transformed, triangle_areas
+from manylights.usd.copies import copies
+from manylights.usd.description import MeshShape, transformed, triangle_areas
 from manylights.usd.images import emissive
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
@@ -32,14 +33,14 @@ class Glow:
         texture: a dictionary for Mitsuba, ``None`` for a constant radiance.
         normalize: divide by the area of the whole prim in the world?
         bsdf: a dictionary for Mitsuba, ``None`` if it does not reflect.
-        uses_uv: whether emission or reflection look up texture coordinates.
+        needs_mesh: whether emission or reflection vary over the surface.
     """
 
     radiance: np.ndarray
     texture: dict | None
     normalize: bool
     bsdf: dict | None
-    uses_uv: bool
+    needs_mesh: bool
 
 
 class MeshLight:
@@ -67,31 +68,43 @@ class MeshLight:
                 text = "the material of a mesh light does not glow, so it does not tint the light"
                 self.context.notes.add("tint", text, self.inputs.prim)
             else:
-                tint, texture = constant_of(material.emission)
+                tint, texture = constant_of(material.emission, surface)
         elif self.mode == "independent" and material.emission is not None:
             text = "the material of a mesh light glows independently: only the light was read"
             self.context.notes.add("tint", text, self.inputs.prim)
-        uses_uv = texture is not None or (bsdf is not None and material.uv_primvar is not None)
-        return Glow(self.radiance * tint, texture, self.normalize, bsdf, uses_uv)
+        varies = texture is not None or (bsdf is not None and _varies(surface, material))
+        return Glow(self.radiance * tint, texture, self.normalize, bsdf, varies)
 
 
-def glow_of(material) -> Glow | None:
+def glow_of(surface: Surface, material) -> Glow | None:
     """Return what a material emits by itself, None for nothing."""
     if material.emission is None:
         return None
-    radiance, texture = constant_of(material.emission)
+    radiance, texture = constant_of(material.emission, surface)
     if not radiance.any():
         return None
-    return Glow(radiance, texture, False, material.bsdf, material.uv_primvar is not None)
+    varies = texture is not None or _varies(surface, material)
+    return Glow(radiance, texture, False, material.bsdf, varies)
 
 
-def constant_of(emission: dict) -> tuple[np.ndarray, dict | None]:
-    """Split an emission into factors and a texture, None if it is constant."""
-    if emission["type"] == "rgb":
-        value = np.array(emission["value"], dtype=np.float64)
-        value = np.broadcast_to(value, 3)
-        return np.maximum(np.where(np.isfinite(value), value, 0.0), 0.0), None
-    return np.ones(3), emission
+def _varies(surface: Surface, material) -> bool:
+    """Does a material have images, or perhaps the colors of the surface?"""
+    colored = surface.colors is not None or surface.opacity is not None
+    return bool(material.lookups) or colored
+
+
+def constant_of(emission: dict, surface: Surface) -> tuple[np.ndarray, dict | None]:
+    """Split an emission into factors and an image, None if it is constant.
+
+    Of an emission in the colors of the surface the mean is used.
+    """
+    if emission["type"] == "bitmap":
+        return np.ones(3), emission
+    if emission["type"] == "mesh_attribute":
+        value = surface.colors.mean(axis=0)
+    else:
+        value = np.broadcast_to(np.array(emission["value"], dtype=np.float64), 3)
+    return np.maximum(np.where(np.isfinite(value), value, 0.0), 0.0), None
 
 
 def world_areas(surfaces: list[Surface], worlds: np.ndarray) -> np.ndarray:
@@ -124,12 +137,19 @@ def two_sided(surface: Surface) -> Surface:
         np.add.at(sums, faces[:, corner], normals)
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.finfo(float).tiny)
     shift = 0.5 * THICKNESS * np.ptp(points, axis=0).max() * sums
-    uv = surface.uv
-    return Surface(
+
+    def twice(rows):
+        return None if rows is None else np.concatenate([rows, rows])
+
+    return replace(
+        surface,
         positions=np.concatenate([points + shift, points - shift]).astype(np.float32),
         faces=np.concatenate([faces, faces[:, ::-1] + len(points)]).astype(np.uint32),
-        uv=None if uv is None else np.concatenate([uv, uv]),
-        binding=surface.binding,
+        normals=None,
+        uv=twice(surface.uv),
+        colors=twice(surface.colors),
+        opacity=twice(surface.opacity),
+        uv_sets={},
     )
 
 
@@ -149,29 +169,26 @@ def add_lamps(lamps: Lamps, surface: Surface, glow: Glow, worlds, areas) -> list
         radiance = radiance * inverse[:, None]
     if surface.double_sided:
         surface = two_sided(surface)
-    if glow.uses_uv and surface.uv is not None:
-        return _with_uv(surface, glow, worlds, radiance)
-    if glow.texture is not None:
-        # Without texture coordinates a texture has one value
-        radiance = radiance * _mean(glow.texture)
+    if glow.texture is not None and surface.uv is None:
+        # Without texture coordinates an image has one value
+        radiance = radiance * _pixels(glow.texture).mean(axis=(0, 1))
+        glow = replace(glow, texture=None)
+    if glow.needs_mesh:
+        return _own_meshes(surface, glow, worlds, radiance)
     for chunk in chunks(len(worlds), len(surface.faces)):
         lamps.add(surface.positions, surface.faces, worlds[chunk], radiance[chunk], glow.bsdf)
     return []
 
 
-def _with_uv(surface: Surface, glow: Glow, worlds, radiance) -> list[MeshShape]:
-    """Return a mesh for each radiance, with texture coordinates."""
+def _own_meshes(surface: Surface, glow: Glow, worlds, radiance) -> list[MeshShape]:
+    """Return a mesh for each radiance, with texture coordinates and colors."""
     values, which = np.unique(radiance.astype(np.float32), axis=0, return_inverse=True)
-    which = np.ravel(which)
     result = []
     for index, value in enumerate(values):
-        matrices = worlds[which == index]
-        faces = copied_faces(surface.faces.astype(np.int64), len(surface.positions), matrices)
-        positions = transformed(surface.positions, matrices).reshape(-1, 3)
-        uv = np.tile(surface.uv * (1, -1) + (0, 1), (len(matrices), 1))
-        emission = constant(value) if glow.texture is None else scaled(glow.texture, value)
-        mesh = MeshShape(positions.astype(np.float32), faces.reshape(-1, 3).astype(np.uint32))
-        mesh.uv, mesh.bsdf, mesh.radiance = uv.astype(np.float32), glow.bsdf, emission
+        mesh = copies(surface, glow.bsdf, worlds[np.ravel(which) == index])
+        # Mitsuba's density of light samples is wrong on meshes with smooth normals
+        mesh.normals = None
+        mesh.radiance = constant(value) if glow.texture is None else scaled(glow.texture, value)
         result.append(mesh)
     return result
 
@@ -190,7 +207,3 @@ def _pixels(texture: dict) -> np.ndarray:
     if texture.get("raw", False):
         bitmap.set_srgb_gamma(False)
     return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
-
-
-def _mean(texture: dict) -> np.ndarray:
-    return _pixels(texture).mean(axis=(0, 1))
