@@ -195,14 +195,14 @@ class _Values:
 
 def _frame(prim: Usd.Prim, context: Context) -> tuple[np.ndarray, np.ndarray]:
     """Return a camera's axes, right, up and back, without scale, and its position."""
-    matrix = np.eye(4)
+    matrix, path = np.eye(4), prim.GetPath()
     while prim and not prim.IsPseudoRoot():
         xformable = UsdGeom.Xformable(prim)
         if xformable:
             try:
                 matrix = matrix @ local_matrix(xformable, context.time)
             except ValueError as error:
-                raise StageError(f"camera {prim.GetPath()}: {error}") from None
+                raise StageError(f"camera {path}: {error}") from None
             if xformable.GetResetXformStack():
                 break
         prim = prim.GetParent()
@@ -210,7 +210,7 @@ def _frame(prim: Usd.Prim, context: Context) -> tuple[np.ndarray, np.ndarray]:
     right = np.cross(up, back)
     lengths = np.linalg.norm(right), np.linalg.norm(back)
     if min(lengths) < 1e-12:
-        raise StageError("camera: its transform is singular")
+        raise StageError(f"camera {path}: its transform is singular")
     right, back = right / lengths[0], back / lengths[1]
     return np.stack([right, np.cross(back, right), back]), matrix[3, :3]
 
