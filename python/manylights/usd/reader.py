@@ -11,7 +11,7 @@ from manylights.usd.description import instantiate
 from manylights.usd.drawing import Drawing
 from manylights.usd.lights import Lights
 from manylights.usd.settings import Settings
-from manylights.usd.stage import open_stage, quiet, time_of
+from manylights.usd.stage import guarded, open_stage, time_of
 from manylights.usd.traversal import collect
 
 
@@ -99,18 +99,22 @@ def describe(
 ) -> SceneDict:
     """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet."""
     notes = Notes()
-    stage = open_stage(path, notes)
-    delegate = quiet()
-    context = Context(
-        stage=stage,
-        time=time_of(stage, time),
-        notes=notes,
-        purposes=tuple(purposes),
-        subdivision=subdivision,
-        legacy_lights=legacy_lights,
-        blender_light_units=blender_light_units,
-    )
-    skinning.bake(context)
+    with guarded(path):
+        stage = open_stage(path, notes)
+        context = Context(
+            stage=stage,
+            time=time_of(stage, time),
+            notes=notes,
+            purposes=tuple(purposes),
+            subdivision=subdivision,
+            legacy_lights=legacy_lights,
+            blender_light_units=blender_light_units,
+        )
+        skinning.bake(context)
+        return _read(context, camera, default_light)
+
+
+def _read(context: Context, camera, default_light: bool) -> SceneDict:
     batches = collect(context)
     lights = Lights(context)
     drawing = Drawing(context, lights, batches)
@@ -119,9 +123,7 @@ def describe(
             if item.role == "light":
                 lights.add(item.prim, batch.worlds(item))
         drawing.add(batch)
-    scene = _scene(context, lights, drawing, camera, default_light)
-    delegate.TakeUncoalescedDiagnostics()
-    return scene
+    return _scene(context, lights, drawing, camera, default_light)
 
 
 def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_light) -> SceneDict:

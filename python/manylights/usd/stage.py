@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from pathlib import Path
@@ -37,23 +38,24 @@ def open_stage(path, notes: Notes) -> Usd.Stage:
     if not Path(path).is_file() and "[" not in path:
         kind = "is a folder" if Path(path).is_dir() else "no such file"
         raise StageError(f"{path}: {kind}; expected a stage ({', '.join(EXTENSIONS)})")
-    if not Sdf.FileFormat.FindByExtension(Path(path.rstrip("]")).suffix.lstrip(".")):
+    extension = Path(path.rstrip("]")).suffix.lstrip(".")
+    if not extension or not Sdf.FileFormat.FindByExtension(extension):
         raise StageError(f"{path}: not a stage; expected {', '.join(EXTENSIONS)}")
-    # Floods of warnings on stderr say the same as the errors of composition below
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
-    try:
-        stage = Usd.Stage.Open(path)
-    except Tf.ErrorException as error:
-        raise StageError(f"{path}: {_reason(str(error))}") from None
-    finally:
-        delegate.TakeUncoalescedDiagnostics()
+    stage = Usd.Stage.Open(path)
     _note_composition(stage, path, notes)
     return stage
 
 
-def quiet():
-    """Return an object that keeps usd-core's warnings off stderr while it lives."""
-    return UsdUtils.CoalescingDiagnosticDelegate()
+@contextlib.contextmanager
+def guarded(path):
+    """Keep usd-core's warnings off stderr; turn what it raises into an error about the file."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    except Tf.ErrorException as error:
+        raise StageError(f"{os.fspath(path)}: {_reason(str(error))}") from None
+    finally:
+        delegate.TakeUncoalescedDiagnostics()
 
 
 def time_of(stage: Usd.Stage, time: float | None) -> Usd.TimeCode:
