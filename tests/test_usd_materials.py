@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from manylights.usd.geometry import surfaces_of
 from manylights.usd.materials import Materials
 from manylights.usd.mitsuba_meshes import in_world, join, mesh_of
+from manylights.usd.textures import scaled
 from pxr import Usd, UsdUtils
 
 from tests.conftest import require_variant
@@ -452,6 +453,27 @@ def test_circles_in_a_network_end(tmp_path):
         }"""
     material, _ = material_of(square() + preview(connected("emissiveColor"), node), tmp_path)
     assert material.emission["type"] == "bitmap"
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "scalar_spectral"])
+@pytest.mark.parametrize("textured", [True, False])
+def test_emission_above_one_in_spectra_and_its_scale(tmp_path, variant, textured):
+    require_variant(variant)
+    write(tmp_path, "e.exr", np.full((4, 4, 3), [20, 5, 0.5], dtype=np.float32))
+    inputs = (
+        connected("emissiveColor") if textured else "color3f inputs:emissiveColor = (20, 5, .5)"
+    )
+    stage = stage_of(square() + preview(inputs, image_node("e.exr")), tmp_path)
+    image = picture(stage, light=0, emission=True).mean(axis=(0, 1))
+    assert image == pytest.approx([20, 5, 0.5], rel=0.05)
+    context = context_of(stage)
+    surface = surfaces_of(stage.GetPrimAtPath("/a"), context)[0]
+    material = Materials(context).of(surface)
+    half = {
+        "m": mesh_of(surface, material, context, None, "m", scaled(material.emission, [0.5, 1, 2]))
+    }
+    image = picture(stage_of(""), light=0, entries=half).mean(axis=(0, 1))
+    assert image == pytest.approx([10, 5, 1], rel=0.05)
 
 
 # --- normal maps ---

@@ -104,7 +104,7 @@ def meshes_of(stage, time=None, emission=False, **choices):
     return result, context.notes
 
 
-def picture(stage, size=16, from_z=1, light=1.0, lights=None, **choices):
+def picture(stage, size=16, from_z=1, light=1.0, lights=None, entries=None, **choices):
     """Render the square from -1 to 1 in x and y, seen along z, under a constant sky.
 
     Args:
@@ -113,6 +113,7 @@ def picture(stage, size=16, from_z=1, light=1.0, lights=None, **choices):
         from_z: 1 to look from above, -1 from below (x then runs to the left).
         light: radiance of the sky.
         lights: more entries of the scene. Default: none.
+        entries: more shapes. Default: none.
         choices: of ``meshes_of``.
 
     Returns:
@@ -135,6 +136,7 @@ def picture(stage, size=16, from_z=1, light=1.0, lights=None, **choices):
         },
         **shapes,
         **(lights or {}),
+        **(entries or {}),
     }
     if light:
         scene["sky"] = {"type": "constant", "radiance": light}

@@ -10,6 +10,7 @@ from pxr import UsdGeom
 from manylights.usd import primvars
 from manylights.usd.primvars import Values
 from manylights.usd.surface import Surface
+from manylights.usd.vectors import cross, unit
 
 #: Weights of four control points (columns) for 1, t, t^2, t^3 (rows)
 BASES = {
@@ -184,16 +185,16 @@ def _widths(curves, pieces: Pieces, context) -> Values:
 
 def _rings(center: np.ndarray, tangent: np.ndarray, sides: int):
     """Return unit circles around each place, ``(s, t, sides, 3)``, and triangles between them."""
-    tangent = _unit(tangent)
-    chord = _unit(center[:, -1:] - center[:, :1])
+    tangent = unit(tangent)
+    chord = unit(center[:, -1:] - center[:, :1])
     tangent = np.where(np.linalg.norm(tangent, axis=-1, keepdims=True) > 0.5, tangent, chord)
     across = _perpendicular(tangent[:, 0])
     frames = []
     for step in range(tangent.shape[1]):
         # What is left of the last one turns the least
         axis = tangent[:, step]
-        across = _unit(across - (across * axis).sum(-1, keepdims=True) * axis)
-        frames.append(np.stack([across, np.cross(axis, across)], axis=1))
+        across = unit(across - (across * axis).sum(-1, keepdims=True) * axis)
+        frames.append(np.stack([across, cross(axis, across)], axis=1))
     frames = np.stack(frames, axis=1)
     angle = 2 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -208,9 +209,4 @@ def _rings(center: np.ndarray, tangent: np.ndarray, sides: int):
 
 def _perpendicular(axis: np.ndarray) -> np.ndarray:
     least = np.eye(3)[np.abs(axis).argmin(axis=1)]
-    return _unit(np.cross(axis, least))
-
-
-def _unit(rows: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(rows, axis=-1, keepdims=True)
-    return rows / np.where(length > 1e-30, length, 1)
+    return unit(cross(axis, least))

@@ -10,6 +10,7 @@ from pxr import UsdGeom
 from manylights.usd import primvars
 from manylights.usd.primvars import Sizes
 from manylights.usd.surface import Surface
+from manylights.usd.vectors import area_vectors
 
 SEGMENTS = 64
 """Corners of a circle."""
@@ -102,10 +103,7 @@ def revolve(profile: np.ndarray, normals: np.ndarray, segments: int = SEGMENTS):
     )
     faces = (piece + 2 * row * np.arange(len(profile))[:, None, None]).reshape(-1, 3)
     positions = positions.reshape(-1, 3)
-    corners = positions[faces]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
+    area = np.linalg.norm(area_vectors(positions, faces), axis=1)
     faces = faces[area > 1e-12 * max(area.max(), 1e-300)]
     return positions, faces, outside.reshape(-1, 3)
 
@@ -151,9 +149,7 @@ def cube(size: float):
 def sphere(radius: float):
     """Return a sphere of facets with the area of the round one."""
     result = _joined(_arc(radius, 0, -np.pi / 2, np.pi / 2, SEGMENTS // 2))
-    corners = result[0][result[1]]
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(doubled, axis=1).sum() / 2
+    area = np.linalg.norm(area_vectors(*result[:2]), axis=1).sum()
     return result[0] * np.sqrt(4 * np.pi * radius**2 / area), result[1], result[2]
 
 
@@ -217,8 +213,7 @@ def ball(subdivisions: int):
         corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
     positions, faces = np.unique(corners.reshape(-1, 3).round(12), axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
-    edges = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(edges, axis=1).sum() / 2
+    area = np.linalg.norm(area_vectors(positions, faces), axis=1).sum()
     return positions * np.sqrt(4 * np.pi / area), faces
 
 

@@ -160,7 +160,9 @@ def _cut(mesh, polygons: Polygons, holes: np.ndarray, context) -> Surface:
     corners, faces = triangulate(polygons.points, polygons.counts, polygons.indices)
     if context.value(mesh.GetOrientationAttr()) == UsdGeom.Tokens.leftHanded:
         corners = corners[:, [0, 2, 1]]
-    shown = (polygons.face_of[faces] >= 0) & ~np.isin(polygons.face_of[faces], holes)
+    shown = polygons.face_of[faces] >= 0
+    if len(holes):
+        shown &= ~np.isin(polygons.face_of[faces], holes)
     whole = surface_of(polygons, corners[shown], faces[shown], mesh.GetPrim())
     whole.double_sided = bool(context.value(mesh.GetDoubleSidedAttr(), False))
     if not len(whole.faces):
@@ -237,7 +239,9 @@ def _split(whole: Surface, prim, face_count: int, context) -> list[Surface]:
 
 def _indices(value, count: int, prim, context) -> np.ndarray:
     """Return indices of faces, those out of range left out with a note."""
-    faces = np.asarray(value if value is not None else [], dtype=np.int64).ravel()
+    if value is None or not len(value):
+        return np.zeros(0, dtype=np.int64)
+    faces = np.asarray(value, dtype=np.int64).ravel()
     inside = (faces >= 0) & (faces < count)
     if not inside.all():
         text = f"indices of faces that are not in 0..{count - 1} are left out"

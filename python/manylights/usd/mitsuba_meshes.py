@@ -9,6 +9,7 @@ import numpy as np
 
 from manylights.usd.surface import Surface
 from manylights.usd.textures import mitsuba_wrap, to_mitsuba_uv
+from manylights.usd.vectors import area_vectors, cross, unit
 
 
 def in_world(surface: Surface, matrix: np.ndarray) -> Surface:
@@ -26,7 +27,7 @@ def in_world(surface: Surface, matrix: np.ndarray) -> Surface:
     if np.linalg.det(linear) < 0:
         faces = np.ascontiguousarray(faces[:, [0, 2, 1]])
     if normals is not None:
-        normals = unit(normals @ cofactors(linear).T)
+        normals = unit(normals @ cofactors(linear).T).astype(np.float32)
     return replace(surface, positions=positions.astype(np.float32), faces=faces, normals=normals)
 
 
@@ -35,15 +36,9 @@ def cofactors(linear: np.ndarray) -> np.ndarray:
 
     A singular matrix has one, too.
     """
-    a, b, c = linear.T
-    matrix = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    columns = linear.T
+    matrix = cross(columns[[1, 2, 0]], columns[[2, 0, 1]]).T
     return -matrix if np.linalg.det(linear) < 0 else matrix
-
-
-def unit(rows: np.ndarray) -> np.ndarray:
-    """Return rows of length 1, those that are zero unchanged."""
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return (rows / np.where(length > 0, length, 1)).astype(np.float32)
 
 
 def join(surfaces: list[Surface]) -> Surface:
@@ -142,11 +137,10 @@ def _add_colors(mesh, surface: Surface) -> None:
 
 def with_directions(surface: Surface) -> np.ndarray:
     """Return unit normals, that of a triangle in place of those that are zero."""
-    normals = unit(surface.normals)
+    normals = unit(surface.normals).astype(np.float32)
     missing = ~(np.abs(normals).sum(axis=1) > 0)
     if missing.any():
-        corners = surface.positions[surface.faces].astype(np.float64)
-        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = area_vectors(surface.positions, surface.faces)
         total = np.zeros((len(normals), 3))
         for corner in range(3):
             np.add.at(total, surface.faces[:, corner], flat)

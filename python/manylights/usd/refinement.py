@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from manylights.usd.primvars import Values
+from manylights.usd.vectors import cross, unit
 
 INFINITE = 10.0
 """Sharpness that no level makes smooth, as in OpenSubdiv."""
@@ -172,13 +173,15 @@ class Level:
         """Return smooth normals; they break at edges that stay sharp."""
         inside = points[self.indices].astype(np.float64)
         ahead, behind = inside[self.following] - inside, inside[self.previous] - inside
-        face = np.cross(ahead, behind)
+        face = cross(ahead, behind)
         broken = (self.sharpness >= INFINITE) & (self.edge_faces == 2)
         if not broken.any():
             total = self._sum(self.indices, face, self.point_count)
-            return Values(_unit(total), "vertex")
+            return Values(unit(total).astype(np.float32), "vertex")
         group = self._corner_groups(broken)
-        return Values(_unit(self._sum(group, face, len(self.indices))[group]), "faceVarying")
+        return Values(
+            unit(self._sum(group, face, len(self.indices)))[group].astype(np.float32), "faceVarying"
+        )
 
     def _corner_groups(self, broken: np.ndarray) -> np.ndarray:
         """Number corners so that those of one point with no sharp edge between have the same."""
@@ -203,8 +206,3 @@ class Level:
 def _less_sharp(sharpness: np.ndarray) -> np.ndarray:
     """Return the sharpness one level on."""
     return np.where(sharpness >= INFINITE, sharpness, np.maximum(sharpness - 1, 0))
-
-
-def _unit(rows: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    return (rows / np.where(length > 0, length, 1)).astype(np.float32)

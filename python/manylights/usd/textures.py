@@ -164,7 +164,10 @@ def _dictionary(lookup: Lookup, image: np.ndarray, gamma: bool, role: str) -> di
         image, wrap = np.pad(image, ((1, 1), (1, 1), (0, 0))), "clamp"
         matrix = np.array([[width, 0, 1], [0, height, 1], [0, 0, 1]]) @ matrix
         matrix = np.diag([1 / (width + 2), 1 / (height + 2), 1]) @ matrix
-    bitmap = mi.Bitmap(image)
+    in_spectra = role == "emission" and "spectral" in (mi.variant() or "")
+    # Spectra of colors reach up to 1, and have the white of lamps only below D65
+    peak = max(float(image.max()), 1e-6) if in_spectra and image.dtype != np.uint8 else 1.0
+    bitmap = mi.Bitmap(image if peak == 1 else image / np.float32(peak))
     bitmap.set_srgb_gamma(gamma)
     texture = {"type": "bitmap", "bitmap": bitmap, "wrap_mode": wrap}
     if lookup.threshold > 0:
@@ -174,7 +177,32 @@ def _dictionary(lookup: Lookup, image: np.ndarray, gamma: bool, role: str) -> di
     matrix = FLIP @ matrix @ FLIP
     if not np.allclose(matrix, np.eye(3)):
         texture["to_uv"] = mi.ScalarTransform3f(matrix)
-    return texture
+    return {"type": "d65", "nested": texture, "scale": peak} if in_spectra else texture
+
+
+def scaled(radiance: dict, factor) -> dict:
+    """Return a material's emission times a factor, or one for each channel.
+
+    Args:
+        radiance: as ``Material.emission`` has it.
+        factor: a number, or three.
+    """
+    three = np.broadcast_to(np.asarray(factor, dtype=np.float32), 3)
+    if radiance["type"] == "rgb":
+        values = np.asarray(radiance["value"]) * three
+        return {**radiance, "value": [float(value) for value in values]}
+    if radiance["type"] == "d65":
+        peak = max(float(three.max()), 1e-30)
+        nested = scaled(radiance["nested"], three / peak)
+        return {**radiance, "nested": nested, "scale": radiance["scale"] * peak}
+    if radiance["type"] != "bitmap":
+        return radiance
+    old = radiance["bitmap"]
+    pixels = _with_channels(np.atleast_3d(np.array(old)))
+    pixels = decode(pixels, "srgb" if old.srgb_gamma() else "linear")[..., :3] * three
+    bitmap = mi.Bitmap(np.ascontiguousarray(pixels, dtype=np.float32))
+    bitmap.set_srgb_gamma(False)
+    return {**radiance, "bitmap": bitmap}
 
 
 def mitsuba_wrap(wrap: tuple[str, str]) -> str:

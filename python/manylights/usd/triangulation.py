@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from manylights.usd.vectors import cross, unit
+
 
 def triangulate(points: np.ndarray, counts: np.ndarray, indices: np.ndarray):
     """Cut faces into triangles.
@@ -17,6 +19,10 @@ def triangulate(points: np.ndarray, counts: np.ndarray, indices: np.ndarray):
         ``(m, 3)`` int64 corners of each triangle and ``(m,)`` its face, in the order of faces.
     """
     starts = np.cumsum(counts) - counts
+    if len(counts) and counts[0] >= 3 and (counts == counts[0]).all():
+        corners = np.arange(len(indices)).reshape(len(counts), -1)
+        faces = np.repeat(np.arange(len(counts)), counts[0] - 2)
+        return _cut(points, indices, corners).reshape(-1, 3), faces
     triangles, faces = [], []
     for count in np.unique(counts[counts >= 3]):
         chosen = np.flatnonzero(counts == count)
@@ -52,19 +58,18 @@ def _cut(points, indices, corners: np.ndarray) -> np.ndarray:
 
 def _turns(polygons: np.ndarray) -> np.ndarray:
     """Return by how much each corner turns to the inside, relative to squared edges; ``(f, k)``."""
-    before = polygons - np.roll(polygons, 1, axis=1)
-    after = np.roll(polygons, -1, axis=1) - polygons
-    turn = np.einsum("fki,fi->fk", np.cross(before, after), _normals(polygons))
-    size = np.maximum((after**2).sum(-1).max(axis=1), 1e-300)
+    following = np.arange(1, polygons.shape[1] + 1) % polygons.shape[1]
+    after = polygons[:, following] - polygons
+    normals = _normals(polygons)[:, None]
+    turn = (cross(after[:, following - 2], after) * normals).sum(axis=-1)
+    size = np.maximum((after * after).sum(axis=-1).max(axis=1), 1e-300)
     return turn / size[:, None]
 
 
 def _normals(polygons: np.ndarray) -> np.ndarray:
     """Return unit normals of polygons (Newell's, also if not flat), zero for those without area."""
     relative = polygons - polygons[:, :1]
-    normal = np.cross(relative, np.roll(relative, -1, axis=1)).sum(axis=1)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return normal / np.where(length > 0, length, 1)
+    return unit(cross(relative[:, :-1], relative[:, 1:]).sum(axis=1))
 
 
 def _flatten(polygon: np.ndarray) -> np.ndarray:
