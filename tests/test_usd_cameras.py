@@ -229,3 +229,10 @@ def test_camera_moves_with_time(load):
     for time, z in ((None, 1), (1.5, 1.5), (2, 2)):
         origin, _ = ray(load(LIGHT + camera(place=move), time=time), 0.5, 0.5)
         assert origin[2] == pytest.approx(z, abs=0.01)
+
+
+@pytest.mark.parametrize("axis", ["X", "up"])
+def test_other_up_axes_are_noted(load, axis):
+    scene = load(LIGHT, {"upAxis": axis})
+    assert axis in note(scene, "upAxis")
+    assert scene.metadata["upAxis"] == "Y"

@@ -105,7 +105,7 @@ def framing_sensor(context: Context, points: np.ndarray, settings: Settings) -> 
         (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
     )
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
-    up_axis = str(UsdGeom.GetStageUpAxis(context.stage))
+    up_axis = context.up_axis()
     width, height = _resolution(settings, 4 / 3)
     back = np.array(VIEWS[up_axis]) / np.linalg.norm(VIEWS[up_axis])
     right = np.cross(np.eye(3)["XYZ".index(up_axis)], back)

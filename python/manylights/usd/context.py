@@ -81,5 +81,13 @@ class Context:
         value = attribute.Get(time)
         return fallback if value is None else value
 
+    def up_axis(self) -> str:
+        """Return the axis that points up, ``"Y"`` or ``"Z"``."""
+        axis = str(UsdGeom.GetStageUpAxis(self.stage))
+        if axis in ("Y", "Z"):
+            return axis
+        self.notes.add("upAxis", f"upAxis {axis} is neither Y nor Z and was read as Y", "/")
+        return "Y"
+
     def __post_init__(self) -> None:
         self.transforms = UsdGeom.XformCache(self.time)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
+from manylights.usd.vectors import cross
+
 
 @dataclass
 class MeshShape:
@@ -101,4 +103,4 @@ def copied_faces(faces: np.ndarray, vertices: int, matrices: np.ndarray) -> np.n
 def triangle_areas(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return areas, ``(..., k, 3)`` and ``(m, 3)`` to ``(..., m)``."""
     a, b, c = (positions[..., faces[:, corner], :] for corner in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    return 0.5 * np.linalg.norm(cross(b - a, c - a), axis=-1)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
-from pxr import UsdGeom
 
 from manylights.usd.context import Context
 from manylights.usd.images import Image, read_image
@@ -69,7 +68,7 @@ class Domes:
         if inputs.prim.GetTypeName() != "DomeLight_1":
             return "Y"
         axis = str(inputs.own("poleAxis", "scene"))
-        return str(UsdGeom.GetStageUpAxis(self.context.stage)) if axis == "scene" else axis
+        return self.context.up_axis() if axis == "scene" else axis
 
     def finish(self) -> dict[str, dict]:
         """Return the environment of the stage, if it has one, by its id."""

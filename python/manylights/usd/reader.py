@@ -187,6 +187,6 @@ def _metadata(context: Context) -> dict:
     time = context.time
     return {
         "metersPerUnit": float(UsdGeom.GetStageMetersPerUnit(context.stage)),
-        "upAxis": str(UsdGeom.GetStageUpAxis(context.stage)),
+        "upAxis": context.up_axis(),
         "time": None if time.IsDefault() else float(time.GetValue()),
     }

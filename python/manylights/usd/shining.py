@@ -11,11 +11,12 @@ from pxr import UsdLux
 from manylights.usd.context import Context
 from manylights.usd.copies import copies
 from manylights.usd.description import MeshShape, transformed, triangle_areas
-from manylights.usd.images import emissive
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
 from manylights.usd.shaping import Cone
 from manylights.usd.surface import Surface
+from manylights.usd.textures import scaled
+from manylights.usd.vectors import area_vectors
 
 #: Triangles that are handled at once, and that fit into memory.
 CHUNK, MOST_TRIANGLES = 2_000_000, 20_000_000
@@ -98,7 +99,7 @@ def constant_of(emission: dict, surface: Surface) -> tuple[np.ndarray, dict | No
 
     Of an emission in the colors of the surface the mean is used.
     """
-    if emission["type"] == "bitmap":
+    if emission["type"] in ("bitmap", "d65"):
         return np.ones(3), emission
     if emission["type"] == "mesh_attribute":
         value = surface.colors.mean(axis=0)
@@ -129,9 +130,7 @@ def two_sided(surface: Surface) -> Surface:
     On coincident triangles chance would decide which side a ray meets.
     """
     points, faces = surface.positions.astype(np.float64), surface.faces.astype(np.int64)
-    normals = np.cross(
-        points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
-    )
+    normals = area_vectors(points, faces)
     sums = np.zeros_like(points)
     for corner in range(3):
         np.add.at(sums, faces[:, corner], normals)
@@ -171,7 +170,7 @@ def add_lamps(lamps: Lamps, surface: Surface, glow: Glow, worlds, areas) -> list
         surface = two_sided(surface)
     if glow.texture is not None and surface.uv is None:
         # Without texture coordinates an image has one value
-        radiance = radiance * _pixels(glow.texture).mean(axis=(0, 1))
+        radiance = radiance * _mean(glow.texture)
         glow = replace(glow, texture=None)
     if glow.needs_mesh:
         return _own_meshes(surface, glow, worlds, radiance)
@@ -193,17 +192,8 @@ def _own_meshes(surface: Surface, glow: Glow, worlds, radiance) -> list[MeshShap
     return result
 
 
-def scaled(texture: dict, factors) -> dict:
-    """Return a ``bitmap`` texture of radiance times three factors."""
-    own = ("type", "filename", "bitmap", "raw")
-    kept = {key: value for key, value in texture.items() if key not in own}
-    return emissive(_pixels(texture) * np.asarray(factors), **kept)
-
-
-def _pixels(texture: dict) -> np.ndarray:
-    """Return the linear pixels of a ``bitmap`` texture."""
-    bitmap = texture["bitmap"] if "bitmap" in texture else mi.Bitmap(texture["filename"])
-    bitmap = mi.Bitmap(bitmap)
-    if texture.get("raw", False):
-        bitmap.set_srgb_gamma(False)
-    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+def _mean(texture: dict) -> np.ndarray:
+    """Return the mean of an image."""
+    scale, image = texture.get("scale", 1.0), texture.get("nested", texture)
+    linear = image["bitmap"].convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    return scale * np.array(linear).mean(axis=(0, 1))
