@@ -38,6 +38,7 @@ class Textures:
     def __init__(self, context) -> None:
         self.context = context
         self.pixels: dict[str, np.ndarray | None] = {}
+        self.made: dict[tuple, dict] = {}
 
     def make(self, lookup: Lookup, role: str):
         """Return a texture as a dictionary, or a number or three of them where there is no image.
@@ -47,13 +48,21 @@ class Textures:
             role: ``"color"``, ``"emission"``, ``"data"`` (one number) or ``"normal"``.
         """
         path, resolved, layer = file_path(lookup, self.context)
+        if not path:
+            text = "a texture has no file, its fallback value is used"
+            self.context.notes.add("texture without a file", text, lookup.node)
         if path and UsdShade.UdimUtils.IsUdimIdentifier(path):
             pixels, lookup.to_uv = self._tiles(lookup, path, layer)
         else:
             pixels = self._read(path, resolved, lookup.node)
         if pixels is None:
             return _fit(lookup.of_channel(lookup.fallback), role)
-        return self._texture(lookup, role, pixels, path)
+        numbers = (lookup.scale, lookup.bias, lookup.to_uv)
+        key = (str(resolved or path), role, lookup.channel, lookup.wrap, lookup.color_space)
+        key += (lookup.threshold, *(tuple(np.ravel(part)) for part in numbers))
+        if key not in self.made:
+            self.made[key] = self._texture(lookup, role, pixels, path)
+        return dict(self.made[key])
 
     def _texture(self, lookup: Lookup, role: str, pixels: np.ndarray, path: str) -> dict:
         notes, channel = self.context.notes, lookup.channel
@@ -75,7 +84,9 @@ class Textures:
             )
             image = (image + 1) / 2 if role == "normal" else np.clip(image, *LIMITS[role])
             image = image >= lookup.threshold if lookup.threshold > 0 else image
-            image, gamma = image.astype(np.float32), False
+            # Half precision holds what 8 bits or a half were
+            half = pixels.dtype in (np.uint8, np.float16) and np.abs(image).max() < 60_000
+            image, gamma = image.astype(np.float16 if half else np.float32), False
         if role == "data" and image.shape[2] == 3:
             image, gamma = _luminance(image, gamma), False
         if role in ("color", "emission") and image.shape[2] == 1:
@@ -232,7 +243,7 @@ def _with_channels(pixels: np.ndarray) -> np.ndarray:
     if channels == 4:
         return pixels
     whole = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
-    alpha = np.full_like(pixels[..., :1], whole) if channels in (1, 3) else pixels[..., 1:2]
+    alpha = pixels[..., 1:2] if channels == 2 else np.full_like(pixels[..., :1], whole)
     color = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     return np.concatenate([color, alpha], axis=2)
 
