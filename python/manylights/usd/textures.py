@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import tempfile
 
 import mitsuba as mi
 import numpy as np
@@ -104,27 +106,18 @@ class Textures:
 
     def _decode_file(self, path: str, resolved, node) -> np.ndarray | None:
         notes, where = self.context.notes, node.GetPath()
-        asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(str(resolved))) if resolved else None
-        if not asset:
-            text = f"texture {path} is missing, its fallback value is used"
-            notes.add("missing texture", text, where)
-            return None
-        data = bytes(asset.GetBuffer())
         try:
-            width, height = size_of_png(data)
-            if width * height > MOST_PIXELS:
-                raise ValueError(f"{width} x {height} pixels are more than {MOST_PIXELS}")
-            stream = mi.MemoryStream()
-            stream.write(data)
-            stream.seek(0)
-            pixels = np.array(mi.Bitmap(stream))
+            pixels = read_image(str(resolved or ""))
         except (RuntimeError, ValueError, MemoryError) as error:
             reason = " ".join(str(error).split())
             text = f"texture {path} cannot be read ({reason}), its fallback value is used"
             notes.add("broken texture", text, where)
             return None
-        pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-        return _at_least_two(pixels)
+        if pixels is None:
+            text = f"texture {path} is missing, its fallback value is used"
+            notes.add("missing texture", text, where)
+            return None
+        return _at_least_two(pixels[..., None] if pixels.ndim == 2 else pixels)
 
     def _tiles(self, lookup: Lookup, path: str, layer):
         """Return one image of all tiles of a texture, and the matrix that leads into it."""
@@ -222,6 +215,34 @@ def mitsuba_wrap(wrap: tuple[str, str]) -> str:
     if "black" in names:
         return "black"
     return names[0] if names[0] in ("repeat", "mirror", "clamp") else "repeat"
+
+
+def read_image(path: str) -> np.ndarray | None:
+    """Return the pixels of a file, also of one inside of a package; ``None`` if it is not there.
+
+    Raises:
+        RuntimeError: Mitsuba cannot read it.
+        ValueError: it is too large.
+    """
+    if os.path.isfile(path):
+        with open(path, "rb") as file:
+            check_size(*size_of_png(file.read(24)))
+        return np.array(mi.Bitmap(path))
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)) if path else None
+    if not asset:
+        return None
+    # Not from memory: Mitsuba's reader of broken OpenEXR files does not end there
+    with tempfile.TemporaryDirectory() as folder:
+        file = os.path.join(folder, os.path.basename(path).rstrip("]"))
+        with open(file, "wb") as copy:
+            copy.write(asset.GetBuffer())
+        return read_image(file)
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise a ``ValueError`` if an image claims to be larger than any."""
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"{width} x {height} pixels are more than {MOST_PIXELS}")
 
 
 def size_of_png(data: bytes) -> tuple[int, int]:
