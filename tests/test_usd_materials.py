@@ -415,7 +415,7 @@ def test_images_in_packages_are_read(tmp_path):
     [
         ("none.png", "missing texture"),
         ("tiles.<UDIM>.png", "missing texture"),
-        *((name, "broken texture") for name in ("text.png", "cut.png", "huge.png")),
+        *((name, "broken texture") for name in ("text.png", "cut.png", "huge.png", "cut.exr")),
     ],
 )
 def test_images_that_cannot_be_read_have_their_fallback(tmp_path, name, kind):
@@ -423,6 +423,9 @@ def test_images_that_cannot_be_read_have_their_fallback(tmp_path, name, kind):
     whole = (tmp_path / "whole.png").read_bytes()
     (tmp_path / "text.png").write_text("no image")
     (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    write(tmp_path, "whole.exr", np.full((32, 32, 3), 0.5, dtype=np.float32))
+    cut = (tmp_path / "whole.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(cut[: len(cut) // 2])
     (tmp_path / "huge.png").write_bytes(whole[:16] + b"\0\1\0\0" * 2 + whole[24:])
     node = image_node(name, "float4 inputs:fallback = (.1, .2, .3, .4)")
     material, notes = material_of(square() + preview(connected("diffuseColor"), node), tmp_path)
@@ -552,6 +555,13 @@ def test_opacity_is_noted_unless_it_is_presence():
     assert kinds(material_of(text)[1]) == []
 
 
+def test_opaque_alpha_makes_no_mask(tmp_path):
+    write(tmp_path, "i.png", np.full((4, 4, 3), 188, dtype=np.uint8))
+    text = square() + preview(connected("opacity", "a"), image_node("i.png"))
+    material, notes = material_of(text, tmp_path)
+    assert material.bsdf["type"] == "twosided" and not notes
+
+
 def test_cutouts_are_sharp(tmp_path):
     alpha = np.zeros((8, 8, 4), dtype=np.uint8)
     alpha[:, :4, 3], alpha[:, 4:, 3] = 127, 128
@@ -655,6 +665,32 @@ def test_bindings_are_inherited_and_subsets_have_their_own():
     assert principled(material_of(text, path="/w/b")[0])["base_color"]["value"] == [0.25, 0, 0]
 
 
+def test_only_the_emissive_subset_shines():
+    # Two unit squares, of which one has the radiance 5: the flux is 5 pi
+    text = """def Mesh "a" {
+        int[] faceVertexCounts = [4, 4]
+        int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4]
+        point3f[] points = [(-1, 0, 0), (0, 0, 0), (1, 0, 0), (-1, 1, 0), (0, 1, 0), (1, 1, 0)]
+        def GeomSubset "s" {
+            uniform token elementType = "face"
+            uniform token familyName = "materialBind"
+            int[] indices = [1]
+            rel material:binding = </m>
+        }
+    }
+    """ + preview("color3f inputs:emissiveColor = (5, 5, 5)")
+    stage = stage_of(text)
+    context = context_of(stage)
+    surfaces = surfaces_of(stage.GetPrimAtPath("/a"), context)
+    materials = [Materials(context).of(surface) for surface in surfaces]
+    flux = [
+        np.pi * area(s) * m.emission["value"][0] for s, m in zip(surfaces, materials) if m.emission
+    ]
+    assert flux == pytest.approx([5 * np.pi])
+    image = picture(stage, size=2, light=0, emission=True).mean(axis=2)
+    assert image == pytest.approx(np.array([[0, 5], [0, 0]]))
+
+
 def test_materials_that_are_missing_or_without_a_surface_are_counted():
     text = square("rel material:binding = </gone>") + "".join(
         square(BOUND.replace("/m", "/empty"), f"b{i}") for i in range(3)
@@ -740,10 +776,16 @@ def test_images_of_material_x(tmp_path):
             int inputs:index = 1
             float outputs:out
         }
+        def Shader "n" {
+            uniform token info:id = "ND_normalmap_float"
+            float3 inputs:in.connect = </m/i.outputs:out>
+            float3 outputs:out
+        }
     """
     inputs = """
         color3f inputs:base_color.connect = </m/i.outputs:out>
         float inputs:specular_roughness.connect = </m/e.outputs:out>
+        float3 inputs:normal.connect = </m/n.outputs:out>
     """
     text = square() + mtlx("ND_standard_surface_surfaceshader", inputs, nodes)
     material, notes = material_of(text, tmp_path)
@@ -752,7 +794,8 @@ def test_images_of_material_x(tmp_path):
     assert texel(found["base_color"], 0.375, 0.75) == pytest.approx([0, 1, 0], abs=1e-3)
     assert texel(found["roughness"], 0.375, 0.75) == pytest.approx(1, abs=1e-3)
     assert texel(found["roughness"], 0.125, 0.75) == pytest.approx(0, abs=1e-3)
-    assert not notes
+    normals = np.array(material.bsdf["bsdf"]["normalmap"]["bitmap"])
+    assert normals[0, 0] == pytest.approx([1, 0, 0]) and not notes
 
 
 def test_preview_surface_is_taken_before_other_contexts():

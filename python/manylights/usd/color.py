@@ -30,7 +30,7 @@ def encoding_of(lookup, pixels: np.ndarray, role: str, path: str, notes) -> str:
         return "acescg" if role in ("color", "emission") else "linear"
     byte_color = pixels.dtype == np.uint8 and pixels.shape[2] >= 3
     if role in ("data", "normal"):
-        if byte_color:
+        if byte_color and lookup.channel != "a":
             text = "data in images without an authored color space are read as raw"
             notes.add("data color space", text, lookup.node.GetPath())
         return "linear"

@@ -77,7 +77,7 @@ class Materials:
         if material and _is_for_full(relationship):
             return material
         material, _ = binding.ComputeBoundMaterial(UsdShade.Tokens.preview)
-        if not material and binding.GetDirectBindingRel().GetTargets():
+        if not material and _has_binding(prim):
             text = "a material is bound that is not there: grey, or displayColor"
             self.context.notes.add("missing material", text, prim)
         return material or None
@@ -174,6 +174,15 @@ def surface_shaders(material) -> list:
         if computed:
             found.append((output.GetFullName(), UsdShade.Shader(attribute.GetPrim())))
     return found
+
+
+def _has_binding(prim) -> bool:
+    """Is a prim, or one above it, bound to anything?"""
+    while prim:
+        if UsdShade.MaterialBindingAPI(prim).GetDirectBindingRel().GetTargets():
+            return True
+        prim = prim.GetParent()
+    return False
 
 
 def _is_for_full(relationship) -> bool:

@@ -52,6 +52,8 @@ def evaluate_node(shader, output, context, depth: int):
     found = evaluate(_first(shader, ("in", "in1")), context, depth + 1)
     if name.startswith("multiply_"):
         return _scaled(found, evaluate(shader.GetInput("in2"), context, depth + 1), shader, context)
+    if name.startswith("normalmap") and isinstance(found, Lookup):
+        found.scale, found.bias = np.full(4, 2.0), np.full(4, -1.0)
     if channel is None:
         return found
     if isinstance(found, Lookup):

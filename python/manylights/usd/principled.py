@@ -64,6 +64,14 @@ class Look:
         return any(isinstance(part, Attribute) for part in self.parts())
 
 
+def is_white(texture) -> bool:
+    """Is this an image that is 1 everywhere, as the alpha of many is?"""
+    if not isinstance(texture, dict) or texture["type"] != "bitmap":
+        return False
+    pixels = np.array(texture["bitmap"])
+    return bool((pixels == (np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)).all())
+
+
 class Principled:
     """Makes dictionaries of looks.
 
@@ -163,7 +171,7 @@ class Principled:
         if isinstance(look.opacity, Lookup):
             look.opacity.threshold = look.threshold
         opacity = self._number(look.opacity)
-        if opacity == 1.0:
+        if opacity == 1.0 or is_white(opacity):
             return bsdf
         if look.threshold > 0 and not isinstance(opacity, dict):
             return bsdf if opacity >= look.threshold else {"type": "null"}

@@ -128,8 +128,6 @@ def evaluate_node(shader, output, context, depth: int):
 
 def _uv_texture(shader, channel: str, context) -> Lookup:
     lookup = Lookup(shader.GetInput("file"), shader, channel if channel in "rgba" else "rgb")
-    if not lookup.file:
-        context.notes.add("texture without a file", "a texture has no file", shader)
     for name in ("scale", "bias", "fallback"):
         value = constant(shader, name, context)
         if value is not None:

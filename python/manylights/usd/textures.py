@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import tempfile
 
 import mitsuba as mi
 import numpy as np
@@ -38,6 +40,7 @@ class Textures:
     def __init__(self, context) -> None:
         self.context = context
         self.pixels: dict[str, np.ndarray | None] = {}
+        self.made: dict[tuple, dict] = {}
 
     def make(self, lookup: Lookup, role: str):
         """Return a texture as a dictionary, or a number or three of them where there is no image.
@@ -47,13 +50,21 @@ class Textures:
             role: ``"color"``, ``"emission"``, ``"data"`` (one number) or ``"normal"``.
         """
         path, resolved, layer = file_path(lookup, self.context)
+        if not path:
+            text = "a texture has no file, its fallback value is used"
+            self.context.notes.add("texture without a file", text, lookup.node)
         if path and UsdShade.UdimUtils.IsUdimIdentifier(path):
             pixels, lookup.to_uv = self._tiles(lookup, path, layer)
         else:
             pixels = self._read(path, resolved, lookup.node)
         if pixels is None:
             return _fit(lookup.of_channel(lookup.fallback), role)
-        return self._texture(lookup, role, pixels, path)
+        numbers = (lookup.scale, lookup.bias, lookup.to_uv)
+        key = (str(resolved or path), role, lookup.channel, lookup.wrap, lookup.color_space)
+        key += (lookup.threshold, *(tuple(np.ravel(part)) for part in numbers))
+        if key not in self.made:
+            self.made[key] = self._texture(lookup, role, pixels, path)
+        return dict(self.made[key])
 
     def _texture(self, lookup: Lookup, role: str, pixels: np.ndarray, path: str) -> dict:
         notes, channel = self.context.notes, lookup.channel
@@ -75,7 +86,9 @@ class Textures:
             )
             image = (image + 1) / 2 if role == "normal" else np.clip(image, *LIMITS[role])
             image = image >= lookup.threshold if lookup.threshold > 0 else image
-            image, gamma = image.astype(np.float32), False
+            # Half precision holds what 8 bits or a half were
+            half = pixels.dtype in (np.uint8, np.float16) and np.abs(image).max() < 60_000
+            image, gamma = image.astype(np.float16 if half else np.float32), False
         if role == "data" and image.shape[2] == 3:
             image, gamma = _luminance(image, gamma), False
         if role in ("color", "emission") and image.shape[2] == 1:
@@ -93,27 +106,18 @@ class Textures:
 
     def _decode_file(self, path: str, resolved, node) -> np.ndarray | None:
         notes, where = self.context.notes, node.GetPath()
-        asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(str(resolved))) if resolved else None
-        if not asset:
-            text = f"texture {path} is missing, its fallback value is used"
-            notes.add("missing texture", text, where)
-            return None
-        data = bytes(asset.GetBuffer())
         try:
-            width, height = size_of_png(data)
-            if width * height > MOST_PIXELS:
-                raise ValueError(f"{width} x {height} pixels are more than {MOST_PIXELS}")
-            stream = mi.MemoryStream()
-            stream.write(data)
-            stream.seek(0)
-            pixels = np.array(mi.Bitmap(stream))
+            pixels = read_image(str(resolved or ""))
         except (RuntimeError, ValueError, MemoryError) as error:
             reason = " ".join(str(error).split())
             text = f"texture {path} cannot be read ({reason}), its fallback value is used"
             notes.add("broken texture", text, where)
             return None
-        pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-        return _at_least_two(pixels)
+        if pixels is None:
+            text = f"texture {path} is missing, its fallback value is used"
+            notes.add("missing texture", text, where)
+            return None
+        return _at_least_two(pixels[..., None] if pixels.ndim == 2 else pixels)
 
     def _tiles(self, lookup: Lookup, path: str, layer):
         """Return one image of all tiles of a texture, and the matrix that leads into it."""
@@ -213,6 +217,34 @@ def mitsuba_wrap(wrap: tuple[str, str]) -> str:
     return names[0] if names[0] in ("repeat", "mirror", "clamp") else "repeat"
 
 
+def read_image(path: str) -> np.ndarray | None:
+    """Return the pixels of a file, also of one inside of a package; ``None`` if it is not there.
+
+    Raises:
+        RuntimeError: Mitsuba cannot read it.
+        ValueError: it is too large.
+    """
+    if os.path.isfile(path):
+        with open(path, "rb") as file:
+            check_size(*size_of_png(file.read(24)))
+        return np.array(mi.Bitmap(path))
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)) if path else None
+    if not asset:
+        return None
+    # Not from memory: Mitsuba's reader of broken OpenEXR files does not end there
+    with tempfile.TemporaryDirectory() as folder:
+        file = os.path.join(folder, os.path.basename(path).rstrip("]"))
+        with open(file, "wb") as copy:
+            copy.write(asset.GetBuffer())
+        return read_image(file)
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise a ``ValueError`` if an image claims to be larger than any."""
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"{width} x {height} pixels are more than {MOST_PIXELS}")
+
+
 def size_of_png(data: bytes) -> tuple[int, int]:
     """Return the width and height that a PNG file claims, ``(0, 0)`` for other files."""
     if data[:8] != b"\x89PNG\r\n\x1a\n" or len(data) < 24:
@@ -232,7 +264,7 @@ def _with_channels(pixels: np.ndarray) -> np.ndarray:
     if channels == 4:
         return pixels
     whole = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
-    alpha = np.full_like(pixels[..., :1], whole) if channels in (1, 3) else pixels[..., 1:2]
+    alpha = pixels[..., 1:2] if channels == 2 else np.full_like(pixels[..., :1], whole)
     color = pixels[..., :3] if channels >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
     return np.concatenate([color, alpha], axis=2)
 

@@ -86,34 +86,27 @@ def ear_clip(polygon: np.ndarray) -> np.ndarray:
 
     One that crosses itself gives triangles, too, though not those of its area.
     """
-    left, triangles, start = list(range(len(polygon))), [], 0
+    left, triangles, start = np.arange(len(polygon)), [], 0
     while len(left) > 3:
-        ear = next(
-            (i for i in _in_turn(len(left), start) if _is_ear(polygon, left, i)),
-            start % len(left),
-        )
-        triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
-        del left[ear]
+        places, count = polygon[left], len(left)
+        turns = ((start + i) % count for i in range(count))
+        ear = next((i for i in turns if _is_ear(places, i)), start % count)
+        triangles.append((left[ear - 1], left[ear], left[(ear + 1) % count]))
+        left = np.delete(left, ear)
         start = ear
     return np.array([*triangles, tuple(left)])
 
 
-def _in_turn(count: int, start: int):
-    return ((start + i) % count for i in range(count))
-
-
-def _is_ear(polygon: np.ndarray, left: list[int], i: int) -> bool:
+def _is_ear(places: np.ndarray, i: int) -> bool:
     """Does the corner turn to the inside, with no other corner in its triangle?"""
-    a, b, c = (polygon[left[k]] for k in (i - 1, i, (i + 1) % len(left)))
+    a, b, c = places[i - 1], places[i], places[(i + 1) % len(places)]
     if _side(a, b, c) <= 0:
         return False
-    others = polygon[
-        [k for k in left if k not in (left[i - 1], left[i], left[(i + 1) % len(left)])]
-    ]
-    inside = (_side(a, b, others) >= 0) & (_side(b, c, others) >= 0) & (_side(c, a, others) >= 0)
+    inside = (_side(a, b, places) >= 0) & (_side(b, c, places) >= 0) & (_side(c, a, places) >= 0)
+    others = places[inside]
     # Corners that meet those of the triangle (a bridge to a hole) do not lie in it
     same = (others == a).all(-1) | (others == b).all(-1) | (others == c).all(-1)
-    return not (inside & ~same).any()
+    return bool(same.all())
 
 
 def _side(a, b, points):
