@@ -1,1 +1,18 @@
-"""USD stages as dictionaries for ``mi.load_dict``; needs ``pip install 'manylights[usd]'``."""
+"""USD stages as dictionaries for ``mi.load_dict``; needs ``pip install 'manylights[usd]'``.
+
+scene = mi.load_dict(manylights.usd.load("scene.usdc"))
+"""
+
+from __future__ import annotations
+
+try:
+    import pxr  # noqa: F401
+except ImportError as error:
+    raise ImportError(
+        "manylights.usd needs usd-core, which is not installed: pip install 'manylights[usd]'"
+    ) from error
+
+from manylights.usd.reader import SceneDict, describe, load
+from manylights.usd.stage import StageError
+
+__all__ = ["SceneDict", "StageError", "describe", "load"]

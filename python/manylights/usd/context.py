@@ -72,10 +72,22 @@ class Context:
         """
         if not attribute:
             return fallback
-        value = attribute.Get(self.time)
-        if value is None and self.time.IsDefault() and attribute.GetNumTimeSamples():
-            value = attribute.Get(Usd.TimeCode.EarliestTime())
+        time = self.time
+        if time.IsDefault() and attribute.GetNumTimeSamples():
+            # Without an authored default, Get would give the schema's fallback
+            source = attribute.GetResolveInfo(time).GetSource()
+            if source in (Usd.ResolveInfoSourceFallback, Usd.ResolveInfoSourceNone):
+                time = Usd.TimeCode.EarliestTime()
+        value = attribute.Get(time)
         return fallback if value is None else value
+
+    def up_axis(self) -> str:
+        """Return the axis that points up, ``"Y"`` or ``"Z"``."""
+        axis = str(UsdGeom.GetStageUpAxis(self.stage))
+        if axis in ("Y", "Z"):
+            return axis
+        self.notes.add("upAxis", f"upAxis {axis} is neither Y nor Z and was read as Y", "/")
+        return "Y"
 
     def __post_init__(self) -> None:
         self.transforms = UsdGeom.XformCache(self.time)

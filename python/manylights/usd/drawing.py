@@ -1,0 +1,161 @@
+"""Geometry as meshes and instances of Mitsuba; what shines is drawn in each of its places."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from pxr import Tf, Usd, UsdLux
+
+from manylights.usd.context import Context
+from manylights.usd.copies import copies
+from manylights.usd.description import transformed
+from manylights.usd.geometry import surfaces_of
+from manylights.usd.lights import Lights, transform
+from manylights.usd.materials import Materials
+from manylights.usd.mitsuba_meshes import checked_uv
+from manylights.usd.shining import MOST_TRIANGLES, Glow, MeshLight, add_lamps, glow_of, world_areas
+from manylights.usd.surface import Surface
+from manylights.usd.traversal import Batch, Item
+
+#: More copies than this of a few triangles cost more as instances of Mitsuba than as one mesh.
+MANY_COPIES, BAKED_TRIANGLES = 256, 4_000_000
+
+
+class Drawing:
+    """Turns the geometry of batches into parts of a description.
+
+    Attributes:
+        entries: those parts by id.
+    """
+
+    def __init__(self, context: Context, lights: Lights, batches: list[Batch]) -> None:
+        self.context, self.lights = context, lights
+        self.materials = Materials(context)
+        self.entries: dict[str, object] = {}
+        self._corners: list[np.ndarray] = []
+        self._pointed = _geometry_lights(context, batches)
+
+    def add(self, batch: Batch) -> None:
+        """Add all geometry of a batch."""
+        quiet: list[tuple[Item, Surface, object]] = []
+        for item in batch.items:
+            if item.role != "geometry":
+                continue
+            try:
+                quiet += self._add_shining(batch, item)
+            except (Tf.ErrorException, ValueError) as error:
+                reason = " ".join(str(error).split())
+                text = f"a geometry could not be read: {reason}"
+                self.context.notes.add("geometry", text, item.prim)
+        if len(batch.transforms) == 1:
+            for item, surface, material in quiet:
+                self._enter(item.prim, copies(surface, material.bsdf, batch.worlds(item)))
+        elif quiet:
+            self._add_instances(batch, quiet)
+
+    def points(self) -> np.ndarray:
+        """Return points that span all geometry in the world, ``(n, 3)``."""
+        return np.concatenate([np.zeros((0, 3)), *self._corners])
+
+    def _enter(self, prim: Usd.Prim, part) -> str:
+        """Add a part under a name like its prim's path; return it."""
+        base = re.sub(r"\W", "_", str(prim.GetPath()).strip("/")) or "shape"
+        name, number = base, 1
+        while name in self.entries:
+            number += 1
+            name = f"{base}_{number}"
+        self.entries[name] = part
+        return name
+
+    def _add_shining(self, batch: Batch, item: Item) -> list[tuple[Item, Surface, object]]:
+        """Add the surfaces of a prim that shine, return the others with their materials."""
+        surfaces = surfaces_of(item.prim, self.context)
+        surfaces = [surface for surface in surfaces if len(surface.faces)]
+        if not surfaces:
+            return []
+        worlds = batch.worlds(item)
+        self._corners += [_box(surface.positions, worlds) for surface in surfaces]
+        light = self._light(item.prim)
+        quiet, shining = [], []
+        for surface in surfaces:
+            material = self.materials.of(surface)
+            surface.uv = checked_uv(surface, material, self.context)
+            glow = light.glow(surface, material) if light else glow_of(surface, material)
+            if glow is None or not glow.radiance.any():
+                quiet.append((item, surface, material))
+            else:
+                shining.append((surface, glow))
+        if shining:
+            self._shine(item.prim, surfaces, shining, worlds)
+        return quiet
+
+    def _light(self, prim: Usd.Prim) -> MeshLight | None:
+        """Return the light that a geometry is."""
+        if prim.HasAPI(UsdLux.LightAPI):
+            return MeshLight(prim, self.context, tints=True)
+        pointing = self._pointed.get(prim.GetPath())
+        return MeshLight(pointing, self.context, tints=False) if pointing else None
+
+    def _shine(self, prim, surfaces, shining: list[tuple[Surface, Glow]], worlds) -> None:
+        triangles = len(worlds) * sum(len(surface.faces) for surface, _ in shining)
+        if triangles > MOST_TRIANGLES:
+            text = f"{triangles} shining triangles are more than {MOST_TRIANGLES}: left out"
+            self.context.notes.add("instances", text, prim, len(worlds))
+            return
+        areas = None
+        if any(glow.normalize for _, glow in shining):
+            areas = world_areas(surfaces, worlds)
+        for surface, glow in shining:
+            for mesh in add_lamps(self.lights.lamps, surface, glow, worlds, areas):
+                self._enter(prim, mesh)
+        self.lights.count += len(worlds)
+
+    def _add_instances(self, batch: Batch, quiet) -> None:
+        """Add copies of what does not shine."""
+        transforms, first = batch.transforms, quiet[0][0].prim
+        good = np.abs(np.linalg.det(transforms[:, :3, :3])) > 0
+        if not good.all():
+            text = "an instance without extent was left out"
+            self.context.notes.add("instance", text, first, int((~good).sum()))
+            transforms = transforms[good]
+        triangles = sum(len(surface.faces) for _, surface, _ in quiet)
+        if len(transforms) > MANY_COPIES and triangles * len(transforms) <= BAKED_TRIANGLES:
+            for item, surface, material in quiet:
+                self._enter(item.prim, copies(surface, material.bsdf, item.local @ transforms))
+            return
+        group = {"type": "shapegroup"}
+        for index, (item, surface, material) in enumerate(quiet):
+            group[f"shape_{index}"] = copies(surface, material.bsdf, item.local[None])
+        name = self._enter(first, group)
+        for index, matrix in enumerate(transforms):
+            self.entries[f"{name}_instance_{index}"] = {
+                "type": "instance",
+                "to_world": transform(matrix),
+                "shapegroup": {"type": "ref", "id": name},
+            }
+
+
+def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
+    """Return the ``GeometryLight`` prims by the path of the geometry that they point to."""
+    result, drawn = {}, set()
+    for batch in batches:
+        for item in batch.items:
+            drawn.add(item.prim.GetPath())
+            if item.prim.GetTypeName() == "GeometryLight":
+                relation = item.prim.GetRelationship("geometry")
+                for target in relation.GetForwardedTargets() if relation else ():
+                    result[target] = item.prim
+    for target, prim in result.items():
+        if target not in drawn:
+            text = f"a GeometryLight points to {target}, which is not drawn"
+            context.notes.add("geometry light", text, prim)
+    return result
+
+
+def _box(positions: np.ndarray, matrices: np.ndarray) -> np.ndarray:
+    """Return the corners of the box of copies of points, ``(8, 3)``."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    corners = np.stack(np.meshgrid(*zip(low, high)), axis=-1).reshape(8, 3)
+    moved = transformed(corners, matrices).reshape(-1, 3)
+    return np.stack([moved.min(axis=0), moved.max(axis=0)])

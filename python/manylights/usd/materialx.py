@@ -1,0 +1,184 @@
+"""MaterialX nodes in USD: images and constants, standard_surface and open_pbr_surface.
+
+Only what a picture of many lights needs: base color, metalness, roughness, coat, emission, opacity.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import UsdShade
+
+from manylights.usd.principled import Look
+from manylights.usd.shading import (
+    Attribute,
+    Lookup,
+    constant,
+    evaluate,
+    texture_coordinate,
+)
+
+WRAPS = {"periodic": "repeat", "constant": "black"}
+CHANNELS = {
+    "outr": "r",
+    "outg": "g",
+    "outb": "b",
+    "outa": "a",
+    "r": "r",
+    "g": "g",
+    "b": "b",
+    "a": "a",
+}
+
+
+def evaluate_node(shader, output, context, depth: int):
+    """Return what a MaterialX node computes, as ``shading.evaluate`` does."""
+    name = shader.GetShaderId()[len("ND_") :]
+    if name.startswith(("image_", "tiledimage_", "gltf_image_", "gltf_colorimage")):
+        return _image(shader, name, context)
+    if name.startswith("constant_"):
+        return constant(shader, "value", context)
+    if name.startswith("geompropvalue_"):
+        geomprop = constant(shader, "geomprop", context)
+        return Attribute(str(geomprop or ""), constant(shader, "default", context))
+    channel = CHANNELS.get(UsdShade.Utils.GetBaseNameAndType(output.GetName())[0])
+    if name.startswith("extract_"):
+        channel = "rgba"[min(max(int(constant(shader, "index", context, 0)), 0), 3)]
+    elif name.startswith("swizzle_"):
+        letters = str(constant(shader, "channels", context, ""))
+        channel = letters if letters in ("r", "g", "b", "a") else None
+    elif not name.startswith(("separate", "convert_", "normalmap", "dot_", "multiply_", "clamp_")):
+        context.notes.add("node", f"nodes like ND_{name} are not followed", shader)
+        return _default(shader, context)
+    found = evaluate(_first(shader, ("in", "in1")), context, depth + 1)
+    if name.startswith("multiply_"):
+        return _scaled(found, evaluate(shader.GetInput("in2"), context, depth + 1), shader, context)
+    if name.startswith("normalmap") and isinstance(found, Lookup):
+        found.scale, found.bias = np.full(4, 2.0), np.full(4, -1.0)
+    if channel is None:
+        return found
+    if isinstance(found, Lookup):
+        found.channel = channel
+    elif np.ndim(found):
+        found = found["rgba".index(channel)]
+    return found
+
+
+def _first(shader, names):
+    return next((shader.GetInput(name) for name in names if shader.GetInput(name)), None)
+
+
+def _default(shader, context):
+    """Return a value that the node itself has, rather than nothing."""
+    shader_input = _first(shader, ("default", "value"))
+    return None if shader_input is None else context.value(shader_input.GetAttr())
+
+
+def _scaled(found, factor, shader, context):
+    """Return a product of which one side is constant."""
+    if isinstance(factor, (Lookup, Attribute)):
+        found, factor = factor, found
+    if factor is None or found is None:
+        return found
+    if isinstance(factor, (Lookup, Attribute)):
+        context.notes.add("node", "products of two images are the first of them", shader)
+        return found
+    if isinstance(found, Attribute):
+        return found
+    four = np.ones(4)
+    four[: 3 if np.ndim(factor) else 4] = np.array(factor)[:3] if np.ndim(factor) else factor
+    if isinstance(found, Lookup):
+        found.scale, found.bias = found.scale * four, found.bias * four
+        return found
+    return (
+        tuple(np.array(found) * np.array(factor))
+        if np.ndim(found) or np.ndim(factor)
+        else found * factor
+    )
+
+
+def _image(shader, name: str, context) -> Lookup:
+    number = name.endswith("_float")
+    lookup = Lookup(shader.GetInput("file"), shader, "r" if number else "rgb")
+    default = constant(shader, "default", context)
+    if default is not None:
+        lookup.fallback = np.append(np.broadcast_to(np.array(default, dtype=float)[..., :3], 3), 1)
+    modes = [constant(shader, f"{axis}addressmode", context, "periodic") for axis in "uv"]
+    lookup.wrap = tuple(WRAPS.get(mode, str(mode)) for mode in modes)
+    lookup.primvar, lookup.to_uv = texture_coordinate(shader.GetInput("texcoord"), context)
+    if name.startswith("tiledimage_"):
+        tiling = constant(shader, "uvtiling", context, (1, 1))
+        offset = constant(shader, "uvoffset", context, (0, 0))
+        tiles = np.array([[tiling[0], 0, -offset[0]], [0, tiling[1], -offset[1]], [0, 0, 1]])
+        lookup.to_uv = tiles @ lookup.to_uv
+    return lookup
+
+
+class _Inputs:
+    """Reads the inputs of one surface node."""
+
+    def __init__(self, shader, context) -> None:
+        self.shader, self.context = shader, context
+
+    def any(self, name: str, fallback):
+        """Return what feeds an input."""
+        found = evaluate(self.shader.GetInput(name), self.context)
+        return fallback if found is None else found
+
+    def number(self, name: str, fallback: float) -> float:
+        """Return a number; an image in its place is noted."""
+        found = self.any(name, fallback)
+        if isinstance(found, (Lookup, Attribute)):
+            text = f"images on inputs like {name} are not used"
+            self.context.notes.add("textured input", text, self.shader)
+            return fallback
+        return float(np.mean(found))
+
+
+def standard_surface(shader, context) -> Look:
+    """Read an ND_standard_surface_surfaceshader."""
+    inputs = _Inputs(shader, context)
+    look = Look(
+        base_color=inputs.any("base_color", (0.8, 0.8, 0.8)),
+        base_weight=inputs.number("base", 1.0),
+        metallic=inputs.any("metalness", 0.0),
+        roughness=inputs.any("specular_roughness", 0.2),
+        ior=inputs.number("specular_IOR", 1.5),
+        clearcoat=inputs.any("coat", 0.0),
+        clearcoat_roughness=inputs.any("coat_roughness", 0.1),
+        opacity=inputs.any("opacity", 1.0),
+        presence=True,
+        emission=inputs.any("emission_color", (1.0, 1.0, 1.0)),
+        emission_weight=inputs.number("emission", 0.0),
+        normal=evaluate(shader.GetInput("normal"), context),
+    )
+    _note_rest(inputs, ("transmission", "subsurface", "sheen", "thin_film_thickness"))
+    return look
+
+
+def open_pbr(shader, context) -> Look:
+    """Read an ND_open_pbr_surface_surfaceshader; its emission is in nits."""
+    inputs = _Inputs(shader, context)
+    look = Look(
+        base_color=inputs.any("base_color", (0.8, 0.8, 0.8)),
+        base_weight=inputs.number("base_weight", 1.0),
+        metallic=inputs.any("base_metalness", 0.0),
+        roughness=inputs.any("specular_roughness", 0.3),
+        ior=inputs.number("specular_ior", 1.5),
+        clearcoat=inputs.any("coat_weight", 0.0),
+        clearcoat_roughness=inputs.any("coat_roughness", 0.0),
+        opacity=inputs.any("geometry_opacity", 1.0),
+        presence=True,
+        emission=inputs.any("emission_color", (1.0, 1.0, 1.0)),
+        emission_weight=inputs.number("emission_luminance", 0.0),
+        normal=evaluate(shader.GetInput("geometry_normal"), context),
+    )
+    _note_rest(inputs, ("transmission_weight", "subsurface_weight", "fuzz_weight"))
+    return look
+
+
+def _note_rest(inputs: _Inputs, names) -> None:
+    for name in names:
+        value = inputs.any(name, 0.0)
+        if isinstance(value, Lookup) or np.any(np.asarray(value) != 0):
+            text = f"the input {name} of surfaces is not used"
+            inputs.context.notes.add(f"input {name}", text, inputs.shader)

@@ -1,0 +1,192 @@
+"""Puts the parts of a stage together: lights, geometry, camera and settings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
+from manylights.usd import cameras, skinning
+from manylights.usd.context import Context, Notes
+from manylights.usd.description import instantiate
+from manylights.usd.drawing import Drawing
+from manylights.usd.lights import Lights
+from manylights.usd.settings import Settings
+from manylights.usd.stage import guarded, open_stage, time_of
+from manylights.usd.traversal import collect
+
+
+class SceneDict(dict):
+    """A dictionary for ``mi.load_dict``.
+
+    Attributes:
+        notes: what was not carried over, or not as it is; one entry a kind with ``text``, the
+            sentence, ``count``, how often, and ``prim``, the path of the first prim.
+        exposure: the factor by which the camera's exposure brightens the image. It is not in the
+            scene: multiply the image by it.
+        camera: path of the camera, None if one was made up.
+        metadata: ``metersPerUnit``, ``upAxis`` and ``time`` (None for the default time).
+    """
+
+    notes: Notes
+    exposure: float
+    camera: str | None
+    metadata: dict
+
+
+def load(
+    path,
+    *,
+    time=None,
+    camera=None,
+    purposes=("default", "render"),
+    subdivision=None,
+    default_light=False,
+    legacy_lights=False,
+    blender_light_units=False,
+) -> SceneDict:
+    """Read a USD stage as a dictionary for ``mi.load_dict``.
+
+    Lengths stay in units of the stage and axes as they are; radiance is in nits. Lamps that are
+    many and equal become few meshes. Where one mesh has more than a few radiances they are in its
+    attribute ``face_color``, in which only the integrators of this package find light, so the
+    scene has ``manylights_volpath`` unless the stage's render settings ask for another.
+
+    Args:
+        path: of a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+        time: at which attributes are read. Default: the stage's start time if it has one, else the
+            default values, and the earliest samples of attributes that have none.
+        camera: path of the camera. Default: that of the render settings, else the first one, else
+            one that frames the scene.
+        purposes: of the prims that are read.
+        subdivision: levels by which meshes without an authored scheme are refined. Default: their
+            cages are used.
+        default_light: shine from everywhere, with radiance 1, if the stage has no light?
+        legacy_lights: read the inputs of lights from before USD 21.05, without ``inputs:``?
+        blender_light_units: are lights in the units in which Blender exports them?
+
+    Returns:
+        A dictionary with objects of the current variant of Mitsuba, and the attribute ``notes``.
+
+    Raises:
+        StageError: (a ``ValueError``) there is no such file or camera, or the file cannot be read;
+            the text names file and prim.
+    """
+    description = describe(
+        path,
+        time=time,
+        camera=camera,
+        purposes=purposes,
+        subdivision=subdivision,
+        default_light=default_light,
+        legacy_lights=legacy_lights,
+        blender_light_units=blender_light_units,
+    )
+    result = SceneDict(instantiate(description))
+    result.__dict__.update(description.__dict__)
+    return result
+
+
+def describe(
+    path,
+    *,
+    time=None,
+    camera=None,
+    purposes=("default", "render"),
+    subdivision=None,
+    default_light=False,
+    legacy_lights=False,
+    blender_light_units=False,
+) -> SceneDict:
+    """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet."""
+    notes = Notes()
+    with guarded(path):
+        stage = open_stage(path, notes)
+        context = Context(
+            stage=stage,
+            time=time_of(stage, time),
+            notes=notes,
+            purposes=tuple(purposes),
+            subdivision=subdivision,
+            legacy_lights=legacy_lights,
+            blender_light_units=blender_light_units,
+        )
+        skinning.bake(context)
+        return _read(context, camera, default_light)
+
+
+def _read(context: Context, camera, default_light: bool) -> SceneDict:
+    batches = collect(context)
+    lights = Lights(context)
+    drawing = Drawing(context, lights, batches)
+    for batch in batches:
+        for item in batch.items:
+            if item.role == "light":
+                lights.add(item.prim, batch.worlds(item))
+        drawing.add(batch)
+    return _scene(context, lights, drawing, camera, default_light)
+
+
+def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_light) -> SceneDict:
+    geometry = drawing.points()
+    points = np.concatenate([geometry, lights.points()])
+    points = points[np.isfinite(points).all(axis=1)]
+    lights.finish(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0)
+    settings = Settings(context)
+    scene = SceneDict(type="scene")
+    prim = cameras.choose_camera(context, camera, settings)
+    scene.exposure, scene.camera = 1.0, None
+    if prim is None:
+        shown = geometry if len(geometry) else points
+        scene["sensor"] = cameras.framing_sensor(context, shown, settings)
+    else:
+        scene["sensor"], scene.exposure = cameras.sensor_of(prim, context, settings)
+        scene.camera = str(prim.GetPath())
+    scene.update(lights.entries)
+    meshes = lights.lamps.meshes()
+    scene.update({f"lamps_{index}": mesh for index, mesh in enumerate(meshes)})
+    scene.update(drawing.entries)
+    scene["integrator"] = _integrator(context, settings, lights.lamps.uses_attribute)
+    if not lights.count:
+        _without_light(context, scene, default_light)
+    if not len(geometry):
+        context.notes.add("no geometry", "nothing that could be seen is in the stage", "/")
+    scene.notes = context.notes
+    scene.metadata = _metadata(context)
+    return scene
+
+
+def _integrator(context: Context, settings: Settings, uses_attribute: bool) -> dict:
+    """Return the integrator that the stage asks for, one of ours where only ours see the lamps."""
+    asked = settings.integrator()
+    if asked is None:
+        return {"type": VOLPATH}
+    kind = asked.get("type")
+    if uses_attribute and kind in REPLACEMENTS:
+        ours = REPLACEMENTS[kind]
+        kept = {key: value for key, value in asked.items() if key in PARAMETERS[ours]}
+        text = f"the integrator {kind} finds no light on merged lamps, used was {ours}"
+        context.notes.add("integrator", text, settings.prim)
+        return {**kept, "type": ours}
+    return asked
+
+
+def _without_light(context: Context, scene: SceneDict, default_light: bool) -> None:
+    if default_light:
+        text = "the stage has no light, a constant environment of radiance 1 was added"
+        radiance = {"type": "rgb", "value": [1.0, 1.0, 1.0]}
+        scene["environment"] = {"type": "constant", "radiance": radiance}
+    else:
+        text = "the stage has no light: the image is black without --default-light"
+        text += " (default_light=True)"
+    context.notes.add("no light", text, "/")
+
+
+def _metadata(context: Context) -> dict:
+    from pxr import UsdGeom
+
+    time = context.time
+    return {
+        "metersPerUnit": float(UsdGeom.GetStageMetersPerUnit(context.stage)),
+        "upAxis": context.up_axis(),
+        "time": None if time.IsDefault() else float(time.GetValue()),
+    }

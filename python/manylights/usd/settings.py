@@ -1,0 +1,134 @@
+"""Render settings of a stage, with the attributes ``mitsuba:...`` that hdMitsuba reads, too."""
+
+from __future__ import annotations
+
+import math
+
+from pxr import Sdf, Usd, UsdRender
+
+from manylights.usd.context import Context
+
+#: More pixels than this along a side are a slip.
+LARGEST_SIDE = 65536
+
+
+class Settings:
+    """The render settings to use, perhaps none.
+
+    Attributes:
+        prim: a ``RenderSettings`` prim, None if there is none.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self.context = context
+        self.prim = self._find()
+
+    def _find(self) -> Usd.Prim | None:
+        stage = self.context.stage
+        path = stage.GetMetadata("renderSettingsPrimPath")
+        if path:
+            prim = stage.GetPrimAtPath(path) if Sdf.Path.IsValidPathString(path) else None
+            if prim and prim.IsA(UsdRender.Settings):
+                return prim
+            text = f"renderSettingsPrimPath {path} is no RenderSettings"
+            self.context.notes.add("settings", text, path)
+        found = [prim for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
+        if len(found) > 1:
+            text = (
+                f"the stage has {len(found)} RenderSettings and does not say which: none was used"
+            )
+            self.context.notes.add("settings", text, found[0])
+        return found[0] if len(found) == 1 else None
+
+    def _value(self, name: str, fallback=None):
+        """Return an authored attribute."""
+        attribute = self.prim.GetAttribute(name) if self.prim else None
+        if not attribute or not attribute.HasAuthoredValue():
+            return fallback
+        return self.context.value(attribute, fallback)
+
+    def camera(self) -> Sdf.Path | None:
+        """Return the path of the camera."""
+        relation = self.prim.GetRelationship("camera") if self.prim else None
+        targets = relation.GetForwardedTargets() if relation else ()
+        return targets[0] if targets else None
+
+    def resolution(self) -> tuple[int, int] | None:
+        """Return width and height in pixels, if they are authored."""
+        value = self._value("resolution")
+        if value is None:
+            return None
+        width, height = int(value[0]), int(value[1])
+        if min(width, height) < 1 or max(width, height) > LARGEST_SIDE:
+            text = f"resolution ({width}, {height}) of the render settings was ignored"
+            self.context.notes.add("resolution", text, self.prim)
+            return None
+        if float(self._value("pixelAspectRatio", 1.0)) != 1.0:
+            text = "pixels that are not square (pixelAspectRatio) were made square"
+            self.context.notes.add("pixelAspectRatio", text, self.prim)
+        window = self._value("dataWindowNDC", (0, 0, 1, 1))
+        if tuple(window) != (0, 0, 1, 1):
+            text = "dataWindowNDC was ignored, the whole image is rendered"
+            self.context.notes.add("dataWindowNDC", text, self.prim)
+        return width, height
+
+    def conform(self, horizontal: float, vertical: float, aspect: float) -> tuple[float, float]:
+        """Return an aperture with the aspect of the image, by the authored policy."""
+        policy = str(self._value("aspectRatioConformPolicy", "expandAperture"))
+        wide = aspect > horizontal / vertical
+        if policy == "adjustPixelAspectRatio" and not math.isclose(aspect, horizontal / vertical):
+            text = "aspectRatioConformPolicy adjustPixelAspectRatio was read as expandAperture"
+            self.context.notes.add("aspectRatioConformPolicy", text, self.prim)
+        keep_vertical = {
+            "cropAperture": not wide,
+            "adjustApertureWidth": True,
+            "adjustApertureHeight": False,
+        }.get(policy, wide)
+        return (vertical * aspect, vertical) if keep_vertical else (horizontal, horizontal / aspect)
+
+    def sample_count(self) -> int | None:
+        """Return the samples per pixel."""
+        value = self._value("mitsuba:sample_count")
+        if value is None:
+            return None
+        if int(value) < 1:
+            text = f"mitsuba:sample_count {value} was ignored, it has to be at least 1"
+            self.context.notes.add("sample_count", text, self.prim)
+            return None
+        return int(value)
+
+    def sensor_type(self, camera: Usd.Prim) -> str | None:
+        """Return the sensor that a camera, or the settings, ask for."""
+        attribute = camera.GetAttribute("mitsuba:sensor:type")
+        value = self.context.value(attribute) if attribute else self._value("mitsuba:sensor:type")
+        return str(value) if value else None
+
+    def integrator(self) -> dict | None:
+        """Return the integrator, with what is nested in it."""
+        if not self.prim or self._value("mitsuba:integrator:type") is None:
+            return None
+        result: dict = {}
+        prefix = "mitsuba:integrator:"
+        for attribute in self.prim.GetAuthoredAttributes():
+            name = attribute.GetName()
+            value = self.context.value(attribute) if name.startswith(prefix) else None
+            if value is None:
+                continue
+            *parents, key = name[len(prefix) :].split(":")
+            inner = result
+            for parent in parents:
+                inner = inner.setdefault(parent, {})
+            inner[key] = _plain(value)
+        return result
+
+
+def _plain(value):
+    """Return a value of USD as Mitsuba takes it."""
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, Sdf.AssetPath):
+        return value.resolvedPath or value.path
+    try:
+        return [float(part) for part in value]
+    except TypeError:
+        return str(value)

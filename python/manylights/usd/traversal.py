@@ -1,0 +1,300 @@
+"""Finds what a stage draws, and each place where it is drawn.
+
+A :class:`Batch` is a number of equal copies: the whole stage is one with a single copy, and so are
+the instances of a prototype, of a ``PointInstancer`` or native ones. Instancers inside of
+prototypes give batches with one copy for each combination, so a batch never nests another.
+
+Matrices are those of USD: a point is a row vector, ``p @ M``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdLux
+
+from manylights.usd.context import Context
+
+#: More copies than this of one prototype do not fit into memory.
+LARGEST_BATCH = 20_000_000
+
+#: Instancers that instance each other reach this soon, others never.
+MOST_BATCHES = 100_000
+
+#: Types that only hold others, and types that others look up.
+CONTAINERS = ("Xform", "Scope", "SkelRoot", "Camera", "Skeleton", "LightFilter")
+LOOKED_UP = ("Material", "Shader", "NodeGraph", "GeomSubset")
+
+
+@dataclass
+class Item:
+    """A light or a geometry that is drawn.
+
+    Attributes:
+        prim: the prim, an instance proxy in native instances.
+        local: ``(4, 4)`` to the space of its batch.
+        role: ``"light"`` or ``"geometry"``; meshes that are lights are geometry.
+    """
+
+    prim: Usd.Prim
+    local: np.ndarray
+    role: str
+
+
+@dataclass
+class Batch:
+    """Items, and the transforms with which all of them are drawn.
+
+    Attributes:
+        transforms: ``(n, 4, 4)`` to the world.
+        items: in the order of the stage.
+    """
+
+    transforms: np.ndarray
+    items: list[Item] = field(default_factory=list)
+
+    def worlds(self, item: Item) -> np.ndarray:
+        """Return the transforms of an item to the world, ``(n, 4, 4)``."""
+        return item.local @ self.transforms
+
+
+@dataclass
+class _State:
+    """What prims inherit: transform, purpose, and the instancers that they are in."""
+
+    matrix: np.ndarray
+    purpose: str | None = None
+    chain: tuple[Sdf.Path, ...] = ()
+
+
+def collect(context: Context) -> list[Batch]:
+    """Return all that a stage draws with the context's time and purposes.
+
+    Left out is what is invisible or inactive, and prototypes by themselves. Notes say which prims
+    have broken transforms, which instancers lack prototypes, and which types are unknown.
+    """
+    return _Traversal(context).run()
+
+
+def local_matrix(xformable: UsdGeom.Xformable, time: Usd.TimeCode) -> np.ndarray:
+    """Return a prim's own transform; samples count at the default time where there is no default.
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    if time.IsDefault() and xformable.TransformMightBeTimeVarying():
+        matrix = np.eye(4)
+        for op in xformable.GetOrderedXformOps():
+            sampled = op.GetAttr().Get() is None and op.GetNumTimeSamples()
+            at = Usd.TimeCode.EarliestTime() if sampled else time
+            matrix = np.array(op.GetOpTransform(at)) @ matrix
+    else:
+        matrix = np.array(xformable.GetLocalTransformation(time))
+    if not np.isfinite(matrix).all():
+        raise ValueError("its transform is not finite")
+    return matrix
+
+
+class _Traversal:
+    """Walks a stage; prototypes wait until all their instances of one batch are known."""
+
+    def __init__(self, context: Context) -> None:
+        self.context = context
+        self.batches: list[Batch] = []
+        self._waiting: list[tuple] = []
+        self._native: dict[tuple, list[tuple[Usd.Prim, _State]]] = {}
+        self._inherited: dict[Sdf.Path, tuple] = {}
+        self._roles: dict[tuple, str] = {}
+
+    def run(self) -> list[Batch]:
+        """Return the batches, see :func:`collect`."""
+        batch = Batch(np.eye(4)[None])
+        root = self.context.stage.GetPseudoRoot()
+        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+        self._walk(root, _State(np.eye(4)), batch, predicate)
+        while self._waiting:
+            self._walk(*self._waiting.pop())
+        return [batch for batch in self.batches if batch.items]
+
+    def _walk(self, root: Usd.Prim, state: _State, batch: Batch, predicate) -> None:
+        """Add what is drawn at and below a prim, the transform of which is in the batch's."""
+        self.batches.append(batch)
+        stack = [(root, state)]
+        while stack:
+            prim, state = stack.pop()
+            below = self._visit(prim, state, batch, prim == root)
+            if below is not None:
+                children = prim.GetFilteredChildren(predicate)
+                stack.extend((child, below) for child in reversed(children))
+        self._flush_native(batch)
+
+    def _visit(self, prim: Usd.Prim, state: _State, batch: Batch, is_root: bool) -> _State | None:
+        """Add a prim; return what its children inherit, None if they are not drawn."""
+        if prim.IsPseudoRoot():
+            return state
+        role = self._role(prim)
+        if role in ("untyped", "looked up"):
+            return state if role == "untyped" else None
+        imageable = UsdGeom.Imageable(prim)
+        if self.context.value(imageable.GetVisibilityAttr()) == UsdGeom.Tokens.invisible:
+            return None
+        try:
+            state = self._enter(prim, imageable, state, is_root)
+        except ValueError as error:
+            text = f"a prim and all below it was left out: {error}"
+            self.context.notes.add("transform", text, prim)
+            return None
+        if prim.IsInstance() and not is_root:
+            key = (prim.GetPrototype().GetPath(), state.purpose, self._inheritance(prim))
+            self._native.setdefault(key, []).append((prim, state))
+            return None
+        if (state.purpose or UsdGeom.Tokens.default_) in self.context.purposes:
+            if role == "instancer":
+                self._expand(UsdGeom.PointInstancer(prim), state, batch)
+            elif role in ("light", "geometry"):
+                batch.items.append(Item(prim, state.matrix, role))
+            elif role == "unknown":
+                text = f"prims of type {prim.GetTypeName()} are left out"
+                self.context.notes.add(f"type {prim.GetTypeName()}", text, prim)
+        return None if role == "instancer" else state
+
+    def _role(self, prim: Usd.Prim) -> str:
+        kind = (prim.GetTypeName(), tuple(prim.GetAppliedSchemas()))
+        if kind not in self._roles:
+            self._roles[kind] = _role_of(prim)
+        return self._roles[kind]
+
+    def _enter(self, prim, imageable, state: _State, is_root: bool) -> _State:
+        """Return the state with a prim's own purpose and transform."""
+        purpose, matrix = state.purpose, state.matrix
+        authored = imageable.GetPurposeAttr()
+        if authored and authored.HasAuthoredValue():
+            purpose = authored.Get()
+        xformable = UsdGeom.Xformable(prim)
+        if xformable and not is_root and prim.HasProperty("xformOpOrder"):
+            own = local_matrix(xformable, self.context.time)
+            matrix = own if xformable.GetResetXformStack() else own @ matrix
+        return _State(matrix, purpose, state.chain)
+
+    def _inheritance(self, prim: Usd.Prim) -> tuple:
+        """Return the ancestors whose material or primvars an instance inherits, itself included."""
+        path = prim.GetPath()
+        if path not in self._inherited:
+            parent = prim.GetParent()
+            above = () if not parent or parent.IsPseudoRoot() else self._inheritance(parent)
+            names = prim.GetAuthoredPropertyNames()
+            counts = any(name.startswith(("material:binding", "primvars:")) for name in names)
+            self._inherited[path] = (*above, path) if counts else above
+        return self._inherited[path]
+
+    def _flush_native(self, batch: Batch) -> None:
+        """Make one batch of all native instances of a prototype that look the same."""
+        groups, self._native = self._native, {}
+        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+        for members in groups.values():
+            prim, state = members[0]
+            matrices = np.stack([member.matrix for _, member in members])
+            state = _State(np.eye(4), state.purpose, state.chain)
+            self._wait(prim, state, matrices, batch, predicate)
+
+    def _expand(self, instancer: UsdGeom.PointInstancer, state: _State, batch: Batch) -> None:
+        """Make one batch of all instances of each prototype."""
+        prim, notes = instancer.GetPrim(), self.context.notes
+        if prim.GetPath() in state.chain:
+            notes.add("cycle", "a PointInstancer that instances itself was left out there", prim)
+            return
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        indices, matrices = self._instances(instancer, len(targets))
+        inside = _State(np.eye(4), state.purpose, (*state.chain, prim.GetPath()))
+        for index in np.unique(indices):
+            root, chosen = self.context.stage.GetPrimAtPath(targets[index]), indices == index
+            if not root:
+                text = f"a PointInstancer has no prototype {targets[index]}"
+                notes.add("prototype", text, prim, int(chosen.sum()))
+                continue
+            predicate = Usd.PrimIsActive & Usd.PrimIsLoaded
+            if root.IsDefined():
+                predicate = predicate & Usd.PrimIsDefined
+            if not root.IsAbstract():
+                predicate = predicate & ~Usd.PrimIsAbstract
+            predicate = Usd.TraverseInstanceProxies(predicate)
+            if root.IsActive():
+                self._wait(root, inside, matrices[chosen] @ state.matrix, batch, predicate)
+
+    def _instances(self, instancer: UsdGeom.PointInstancer, prototypes: int):
+        """Return prototype and matrix of each visible instance, ``(n,)`` and ``(n, 4, 4)``."""
+        prim, notes, time = instancer.GetPrim(), self.context.notes, self.context.time
+        none = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
+        indices = self.context.value(instancer.GetProtoIndicesAttr())
+        if indices is None or not len(indices):
+            return none
+        indices = np.array(indices, dtype=np.int64)
+        if time.IsDefault() and instancer.GetPositionsAttr().Get() is None:
+            time = Usd.TimeCode.EarliestTime()
+        # With a mask applied the matrices would be fewer than the indices. Prototypes that are
+        # missing or out of range are an error for the function that includes their transforms.
+        matrices = instancer.ComputeInstanceTransformsAtTime(
+            time, time, UsdGeom.PointInstancer.ExcludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+        )
+        matrices = np.array(matrices, dtype=np.float64).reshape(-1, 4, 4)
+        mask = np.array(instancer.ComputeMaskAtTime(time), dtype=bool)
+        if len(matrices) != len(indices) or len(mask) not in (0, len(indices)):
+            text = f"a PointInstancer with {len(indices)} protoIndices has arrays of other sizes"
+            notes.add("instancer", f"{text}: left out", prim)
+            return none
+        for attribute in (instancer.GetScalesAttr(), instancer.GetOrientationsAttr()):
+            values = self.context.value(attribute)
+            if values is not None and len(values) not in (0, len(indices)):
+                text = f"a PointInstancer with {len(indices)} protoIndices has {len(values)}"
+                notes.add("instancer", f"{text} {attribute.GetName()}, which were ignored", prim)
+        keep = mask if len(mask) else np.ones(len(indices), dtype=bool)
+        bad = (indices < 0) | (indices >= prototypes) | ~np.isfinite(matrices).all(axis=(1, 2))
+        if (bad & keep).any():
+            text = "an instance with an index out of range or a transform that is not finite"
+            notes.add("instance", f"{text} was left out", prim, int((bad & keep).sum()))
+        keep = keep & ~bad
+        return indices[keep], self._with_prototypes(instancer, indices[keep], matrices[keep])
+
+    def _with_prototypes(self, instancer, indices, matrices) -> np.ndarray:
+        """Return instances' matrices with the transform of each prototype's root before."""
+        targets = instancer.GetPrototypesRel().GetForwardedTargets()
+        for index in np.unique(indices):
+            xformable = UsdGeom.Xformable(self.context.stage.GetPrimAtPath(targets[index]))
+            if not xformable:
+                continue
+            try:
+                own = local_matrix(xformable, self.context.time)
+            except ValueError as error:
+                own = np.zeros((4, 4))
+                self.context.notes.add("transform", f"a prototype: {error}", xformable.GetPrim())
+            chosen = indices == index
+            matrices[chosen] = own @ matrices[chosen]
+        return matrices
+
+    def _wait(self, root, state: _State, matrices, batch: Batch, predicate) -> None:
+        """Remember a prototype to walk through once for all its copies."""
+        count = len(matrices) * len(batch.transforms)
+        if count > LARGEST_BATCH or len(self.batches) > MOST_BATCHES:
+            text = (
+                f"instances were left out, there are more than {LARGEST_BATCH} or nested too often"
+            )
+            self.context.notes.add("instances", text, root, count)
+            return
+        transforms = (matrices[:, None] @ batch.transforms[None]).reshape(-1, 4, 4)
+        self._waiting.append((root, state, Batch(transforms), predicate))
+
+
+def _role_of(prim: Usd.Prim) -> str:
+    name = str(prim.GetTypeName())
+    if name in LOOKED_UP:
+        return "looked up"
+    if prim.IsA(UsdGeom.PointInstancer):
+        return "instancer"
+    if prim.IsA(UsdGeom.Gprim):
+        return "geometry"
+    if prim.HasAPI(UsdLux.LightAPI):
+        return "light"
+    if not prim.IsA(UsdGeom.Imageable):
+        return "untyped"
+    return "container" if name in CONTAINERS else "unknown"
