@@ -316,7 +316,12 @@ def test_polarizer_before_a_surface_at_brewsters_angle(variant):
             "lamp": {"type": "point", "position": [-10 * sine, 0, 10 * cosine], "intensity": 100.0},
             "pane": {
                 "type": "rectangle",
-                "bsdf": {"type": "pplastic", "alpha": 0.05, "int_ior": 1.5, "diffuse_reflectance": 0},
+                "bsdf": {
+                    "type": "pplastic",
+                    "alpha": 0.05,
+                    "int_ior": 1.5,
+                    "diffuse_reflectance": 0,
+                },
             },
             "sensor": camera((10 * sine, 0, 10 * cosine), (0, 0, 0)),
         }

@@ -19,7 +19,7 @@ import inspect
 import json
 from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -83,18 +83,25 @@ class Source:
     load: Callable[[], MeasuredScene]
 
 
-def find(text: str, defines: dict[str, str] | None = None) -> Source:
+def find(
+    text: str,
+    defines: dict[str, str] | None = None,
+    usd_options: loading.UsdOptions | None = None,
+) -> Source:
     """Find the scene that ``text`` names, and check what can be checked without loading it.
 
     Args:
         text: a scene file or a call of a generator.
         defines: values for the ``<default>`` parameters of XML files. Default: none.
+        usd_options: how USD stages are read. Default: as ``loading.UsdOptions()`` has it.
 
     Raises:
         UsageError: there is no such file or generator, or it does not accept its arguments.
     """
     if Path(text).suffix.lower() in (".xml", *USD_ENDINGS) or Path(text).is_file():
-        return _file(text, defines or {})
+        stage = usd_options or loading.UsdOptions()
+        is_stage = Path(text).suffix.lower() in USD_ENDINGS
+        return _file(text, {} if is_stage else defines or {}, stage)
     if _parse_call(text)[0] not in scenes.names():
         raise UsageError(
             f"{text}: neither an XML file nor a USD stage nor a generator, those are "
@@ -103,22 +110,23 @@ def find(text: str, defines: dict[str, str] | None = None) -> Source:
     return _generated(text)
 
 
-def _file(path: str, defines: dict[str, str]) -> Source:
+def _file(path: str, defines: dict[str, str], stage: loading.UsdOptions) -> Source:
     try:
         with loading.search_beside(path), threads_for_files():
-            files = loading.parse(path, defines).files
+            files = loading.parse(path, defines, stage).files
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
     folder, file_name = Path(path).resolve().parts[-2:]
     text = f"{folder}/{file_name}"
-    digest = hashlib.sha256(json.dumps(defines, sort_keys=True).encode())
+    choices = {**defines, **asdict(stage)} if stage != loading.UsdOptions() else defines
+    digest = hashlib.sha256(json.dumps(choices, sort_keys=True).encode())
     for file in files:
         digest.update(file.read_bytes())
 
     def load() -> MeasuredScene:
         try:
-            return _load_file(path, defines)
+            return _load_file(path, defines, stage)
         except RuntimeError as error:
             raise UsageError(f"{path}: {one_line(error)}") from error
 
@@ -127,9 +135,9 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     return Source(text, name, name, digest.hexdigest(), load)
 
 
-def _load_file(path: str, defines: dict[str, str]) -> MeasuredScene:
+def _load_file(path: str, defines: dict[str, str], stage: loading.UsdOptions) -> MeasuredScene:
     with loading.search_beside(path), threads_for_files():
-        parsed = loading.parse(path, defines)
+        parsed = loading.parse(path, defines, stage)
         plugin, parameters = "path", {}
         for node in integrators.leaf_integrators(parsed.state):
             plugin, parameters = node.props.plugin_name(), dict(node.props.items())

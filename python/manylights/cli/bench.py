@@ -97,6 +97,7 @@ def _add_scenes(parser) -> None:
         help="a scene whose pictures must not be published, any number of times",
     )
     shared.add_define(parser)
+    shared.add_usd(parser)
 
 
 def _run(options) -> None:
@@ -126,13 +127,13 @@ def _tasks(options) -> list[runner.Task]:
     Raises:
         UsageError: no scene, an unknown one, an unknown method, a reference for several scenes.
     """
-    defines = shared.defines(options)
+    defines, stage = shared.defines(options), shared.usd_options(options)
     chosen = _methods(options.methods)
     tasks = standard.standard() if options.standard else standard.quick() if options.quick else []
     if chosen is not None:
         tasks = [replace(task, methods=chosen) for task in tasks]
     for text, private in [*((s, False) for s in options.scene), *((s, True) for s in options.also)]:
-        source = scene_source.find(text, defines)
+        source = scene_source.find(text, defines, stage)
         tasks.append(runner.Task(source, chosen or standard.all_methods(), private=private))
     if not tasks:
         raise UsageError("bench: name a SCENE, --standard or --quick")

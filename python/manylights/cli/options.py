@@ -16,7 +16,7 @@ def add_scene(parser) -> None:
     """Add SCENE and the options that say how it is read; ``defines`` and others give them back."""
     parser.add_argument("scene", metavar="SCENE", help="XML file or USD stage")
     add_define(parser)
-    # Options of USD stages belong here, and into usd_options() below.
+    add_usd(parser)
 
 
 def add_define(parser) -> None:
@@ -28,6 +28,32 @@ def add_define(parser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="value for a <default> parameter of XML scenes, any number of times",
+    )
+
+
+def add_usd(parser) -> None:
+    """Add how USD stages are read; ``usd_options`` gives it back."""
+    group = parser.add_argument_group("USD stages")
+    group.add_argument(
+        "--camera", metavar="PATH", help="prim of the camera (default: the stage's choice)"
+    )
+    group.add_argument(
+        "--time", type=time_code, metavar="T", help="time code (default: the stage's start time)"
+    )
+    group.add_argument(
+        "--subdivision",
+        type=levels,
+        metavar="N",
+        help="refine meshes without an authored scheme N times (default: their cages)",
+    )
+    group.add_argument(
+        "--default-light", action="store_true", help="light stages that have no light, evenly"
+    )
+    group.add_argument(
+        "--legacy-lights", action="store_true", help="read lights written before USD 21.05"
+    )
+    group.add_argument(
+        "--blender-light-units", action="store_true", help="read lights as Blender exports them"
     )
 
 
@@ -49,7 +75,14 @@ def defines(options) -> dict[str, str]:
 
 def usd_options(options) -> loading.UsdOptions:
     """Return how a USD stage is to be read."""
-    return loading.UsdOptions()
+    return loading.UsdOptions(
+        time=options.time,
+        camera=options.camera,
+        subdivision=options.subdivision,
+        default_light=options.default_light,
+        legacy_lights=options.legacy_lights,
+        blender_light_units=options.blender_light_units,
+    )
 
 
 def start(options) -> str:
@@ -79,6 +112,21 @@ def seed(text: str) -> int:
     value = int(text)
     if not 0 <= value < 2**32:
         raise argparse.ArgumentTypeError(f"{text}: must be from 0 to 4294967295")
+    return value
+
+
+def levels(text: str) -> int:
+    """A number of refinements: each makes four times as many faces."""
+    if not text.isdigit() or int(text) > 6:
+        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to 6")
+    return int(text)
+
+
+def time_code(text: str) -> float:
+    """Any finite number."""
+    value = number(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}: must be a number")
     return value
 
 

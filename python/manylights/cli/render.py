@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 from manylights import loading
@@ -69,6 +70,11 @@ def add(commands, common) -> None:
         help="set a parameter of the integrator, any number of times (see below)",
     )
     parser.add_argument(
+        "--hide-lights",
+        action="store_true",
+        help="do not show lamps themselves, only what they light: --set hide_emitters=true",
+    )
+    parser.add_argument(
         "--checkpoint",
         type=shared.seconds,
         metavar="SECONDS",
@@ -92,14 +98,16 @@ def _run(options) -> None:
     defines = shared.defines(options)
     settings = integrators.parse_assignments(options.set, "--set")
     settings = {name: integrators.parse_value(text) for name, text in settings.items()}
+    if options.hide_lights:
+        settings["hide_emitters"] = True
     shared.start(options)
-    loaded = loading.load(
-        options.scene, defines, options.integrator, settings, shared.usd_options(options)
-    )
+    stage = shared.usd_options(options)
+    loaded = loading.load(options.scene, defines, options.integrator, settings, stage)
     for note in loaded.notes:
         say(note)
     # What changes the image and is not in a file: a checkpoint of other choices is refused.
     choices = {"integrator": options.integrator, "set": settings, "define": defines}
+    choices |= {"usd": asdict(stage)} if stage != loading.UsdOptions() else {}
     keeps_state = options.checkpoint is not None
     job = Job.of(loaded, options.sensor, options.spp, options.seed, choices, keeps_state)
     checkpoint = _open_checkpoint(job, target, options.checkpoint) if keeps_state else None
@@ -130,6 +138,7 @@ def render_to(
         "rendering", lambda report: render(job, report, threads, checkpoint), **about_files
     )
     seconds = time.perf_counter() - start
+    bitmap = images.exposed(bitmap, job.loaded.exposure)
     written, notes = images.write_images(bitmap, target)
     if checkpoint is not None:
         checkpoint.remove()

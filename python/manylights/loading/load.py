@@ -27,12 +27,14 @@ class LoadedScene:
         integrator_count: how many integrators it nests.
         notes: what was said about reading it and choosing them.
         files: what it was read from, the scene file first.
+        exposure: factor of the camera, which images are multiplied by.
     """
 
     scene: object
     integrator_count: int
     notes: list[str]
     files: list[Path] = field(default_factory=list)
+    exposure: float = 1.0
 
 
 def load(
@@ -59,7 +61,8 @@ def load(
         nodes = parsed.state.nodes
         count = sum(node.type == mi.ObjectType.Integrator for node in nodes)
         notes += _merge_emitters(parsed)
-        return LoadedScene(instantiate(parsed), max(count, 1), notes, parsed.files)
+        scene = instantiate(parsed)
+        return LoadedScene(scene, max(count, 1), notes, parsed.files, parsed.exposure)
 
 
 def _merge_emitters(parsed: ParsedScene) -> list[str]:

@@ -42,12 +42,14 @@ class ParsedScene:
         state: ``mi.parser.ParserState``: nodes with their properties.
         files: what it was read from, the scene file first, and the files that it refers to.
         notes: what the reader has to say, lines for the log.
+        exposure: factor of the camera, which images are multiplied by.
     """
 
     config: object
     state: object
     files: list[Path]
     notes: list[str] = field(default_factory=list)
+    exposure: float = 1.0
 
 
 def parse(
@@ -77,22 +79,29 @@ def parse(
 def _parse_usd(config, path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
     if defines:
         raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
-    try:
-        from manylights import usd
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "pxr":
-            raise
-        raise UsageError(
-            f"{path}: USD needs the package usd-core, install it with: "
-            "pip install 'manylights[usd]'"
-        ) from error
-    description = usd.load(path, **asdict(options))
+    description = import_usd(path).load(path, **asdict(options))
     state = mi.parser.parse_dict(config, description)
     # A stage composes layers that no node of the scene names.
-    layers = [Path(file) for file in getattr(description, "files", (path,))]
-    return ParsedScene(
-        config, state, [*layers, *files_of(state)], [note.text for note in description.notes]
-    )
+    files = [*map(Path, description.files), *files_of(state)]
+    notes = [note.text for note in description.notes]
+    if description.exposure != 1.0:
+        notes.append(f"camera: its exposure brightens the image {description.exposure:g} times")
+    return ParsedScene(config, state, files, notes, description.exposure)
+
+
+def import_usd(path: str):
+    """Return the module ``manylights.usd``, to read ``path``.
+
+    Raises:
+        UsageError: usd-core is missing.
+    """
+    try:
+        from manylights import usd
+    except ImportError as error:
+        if not isinstance(error.__cause__, ImportError):
+            raise
+        raise UsageError(f"{path}: {error}") from error
+    return usd
 
 
 def files_of(state) -> list[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from manylights import files
 from manylights.output import channels
@@ -37,6 +38,18 @@ def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
         file_format = mi.Bitmap.FileFormat.PNG
         written.append(write_whole(preview, target.with_suffix(".png"), file_format))
     return written, notes
+
+
+def exposed(bitmap, factor: float):
+    """Return a bitmap with the colour channels (R, G, B, Y) multiplied by ``factor``."""
+    if factor == 1.0:
+        return bitmap
+    names = channels.names(bitmap)
+    pixels = np.array(bitmap, dtype=np.float32).reshape(*np.array(bitmap).shape[:2], -1)
+    for index, name in enumerate(names):
+        if name in (*channels.RGB, "Y"):
+            pixels[..., index] *= factor
+    return channels.join(names, pixels)
 
 
 def _preview(bitmap):

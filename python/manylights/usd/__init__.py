@@ -12,7 +12,8 @@ except ImportError as error:
         "manylights.usd needs usd-core, which is not installed: pip install 'manylights[usd]'"
     ) from error
 
+from manylights.usd.convert import write_xml
 from manylights.usd.reader import SceneDict, describe, load
 from manylights.usd.stage import StageError
 
-__all__ = ["SceneDict", "StageError", "describe", "load"]
+__all__ = ["SceneDict", "StageError", "describe", "load", "write_xml"]

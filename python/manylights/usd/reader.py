@@ -11,7 +11,7 @@ from manylights.usd.description import instantiate
 from manylights.usd.drawing import Drawing
 from manylights.usd.lights import Lights
 from manylights.usd.settings import Settings
-from manylights.usd.stage import guarded, open_stage, time_of
+from manylights.usd.stage import guarded, layer_files, open_stage, time_of
 from manylights.usd.traversal import collect
 
 
@@ -25,12 +25,14 @@ class SceneDict(dict):
             scene: multiply the image by it.
         camera: path of the camera, None if one was made up.
         metadata: ``metersPerUnit``, ``upAxis`` and ``time`` (None for the default time).
+        files: the layers that the stage is composed of, that of ``path`` first.
     """
 
     notes: Notes
     exposure: float
     camera: str | None
     metadata: dict
+    files: list[str]
 
 
 def load(
@@ -152,6 +154,7 @@ def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_l
         context.notes.add("no geometry", "nothing that could be seen is in the stage", "/")
     scene.notes = context.notes
     scene.metadata = _metadata(context)
+    scene.files = layer_files(context.stage)
     return scene
 
 

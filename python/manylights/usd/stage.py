@@ -46,6 +46,15 @@ def open_stage(path, notes: Notes) -> Usd.Stage:
     return stage
 
 
+def layer_files(stage: Usd.Stage) -> list[str]:
+    """Return the files of the layers in use, the root layer's first, each once."""
+    root = stage.GetRootLayer()
+    layers = [root, *stage.GetUsedLayers()]
+    # Layers inside of an archive are named ARCHIVE[LAYER]
+    paths = [layer.realPath.partition("[")[0] for layer in layers if not layer.anonymous]
+    return [path for path in dict.fromkeys(paths) if os.path.isfile(path)]
+
+
 @contextlib.contextmanager
 def guarded(path):
     """Keep usd-core's warnings off stderr; turn what it raises into an error about the file."""
