@@ -523,3 +523,87 @@ def test_types_that_are_left_out_are_noted():
     surfaces, notes = read('def NurbsPatch "a" {\n}')
     assert not surfaces and notes[0].kind == "NurbsPatch"
     assert corners(only('def Cube "a" {}')).shape == (12, 3, 3)
+
+
+# --- anything at all ---
+
+small = st.integers(-2, 7)
+coordinate = st.one_of(st.floats(-2, 2, width=32), st.sampled_from([np.nan, np.inf, 1e38, 0.0]))
+points = st.lists(st.tuples(coordinate, coordinate, coordinate), max_size=7)
+
+
+def text_of(value):
+    """Return a number, or several, as USD writes them."""
+    if isinstance(value, (list, tuple)):
+        inside = ", ".join(text_of(part) for part in value)
+        return f"[{inside}]" if isinstance(value, list) else f"({inside})"
+    return repr(value)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    values=st.fixed_dictionaries(
+        {
+            "int[] faceVertexCounts": st.lists(st.integers(-1, 6), max_size=4),
+            "int[] faceVertexIndices": st.lists(small, max_size=12),
+            "point3f[] points": points,
+            "int[] holeIndices": st.lists(small, max_size=2),
+            "int[] creaseIndices": st.lists(small, max_size=4),
+            "int[] creaseLengths": st.lists(small, max_size=2),
+            "float[] creaseSharpnesses": st.lists(coordinate, max_size=2),
+            "int[] cornerIndices": st.lists(small, max_size=2),
+            "float[] cornerSharpnesses": st.lists(coordinate, max_size=2),
+            "normal3f[] normals": points,
+        }
+    ),
+    scheme=st.sampled_from(["none", "catmullClark", "loop", "bilinear"]),
+    interpolation=st.sampled_from(sorted(COUNTS)),
+    color=points,
+    valid=st.booleans(),
+)
+def test_no_mesh_breaks_the_reader(values, scheme, interpolation, color, valid):
+    if valid and values["point3f[] points"]:
+        counts = [max(count, 0) for count in values["int[] faceVertexCounts"]]
+        number = len(values["point3f[] points"])
+        values["int[] faceVertexCounts"] = counts
+        values["int[] faceVertexIndices"] = [(3 * i) % number for i in range(sum(counts))]
+    lines = [f"{name} = {text_of(value)}" for name, value in values.items()]
+    lines.append(f'uniform token subdivisionScheme = "{scheme}"')
+    how = f'(\ninterpolation = "{interpolation}"\n)'
+    lines.append(f"color3f[] primvars:displayColor = {text_of(color)} {how}")
+    surfaces, notes = read(mesh("\n".join([*lines, subset("s", [0, 2])])))
+    assert surfaces or notes
+    for surface in surfaces:
+        assert len(surface.faces) and surface.faces.max() < len(surface.positions)
+        assert np.isfinite(surface.positions).all()
+        assert len(surface.face_of) == len(surface.faces)
+        assert surface.normals is None or np.isfinite(surface.normals).all()
+        assert surface.colors is None or np.isfinite(surface.colors).all()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    counts=st.lists(st.integers(-1, 8), max_size=3),
+    places=points,
+    widths=st.lists(coordinate, max_size=4),
+    kind=st.sampled_from(["linear", "cubic"]),
+    basis=st.sampled_from(["bezier", "bspline", "catmullRom"]),
+    wrap=st.sampled_from(["nonperiodic", "periodic", "pinned"]),
+    valid=st.booleans(),
+)
+def test_no_curves_break_the_reader(counts, places, widths, kind, basis, wrap, valid):
+    counts = [len(places)] if valid else counts
+    surfaces, notes = read(f"""def BasisCurves "a" {{
+        int[] curveVertexCounts = {counts}
+        point3f[] points = {text_of(places)}
+        float[] widths = {text_of(widths)} (
+            interpolation = "vertex"
+        )
+        uniform token type = "{kind}"
+        uniform token basis = "{basis}"
+        uniform token wrap = "{wrap}"
+    }}""")
+    assert surfaces or notes
+    for surface in surfaces:
+        assert surface.faces.max() < len(surface.positions)
+        assert np.isfinite(surface.positions).all()

@@ -920,3 +920,50 @@ def test_meshes_with_zero_normals_have_those_of_their_faces():
     meshes, _ = meshes_of(stage_of(square(body)))
     normals = np.array(mi.traverse(meshes["mesh0"])["vertex_normals"]).reshape(-1, 3)
     assert normals == pytest.approx(np.tile([0, 0, 1], (4, 1)))
+
+
+# --- anything at all ---
+
+odd_values = st.sampled_from(
+    [
+        *("float {} = nan", "float {} = inf", "float {} = -3", "int {} = 2", 'string {} = "a"'),
+        *("color3f {} = (2, nan, -1)", "float2 {} = (1, 2)", "token {}", "asset {} = @none.png@"),
+        *("float {} = None", "float[] {} = [1, 2]", "float {}.connect = </m/gone.outputs:out>"),
+        *("float4 {} = (1, 2, 3, 4)", "float {}.connect = </m.inputs:gone>", "bool {} = true"),
+        "float {}.connect = </m/s.outputs:surface>",
+    ]
+)
+INPUTS = (
+    *("diffuseColor", "roughness", "metallic", "ior", "clearcoat", "clearcoatRoughness", "opacity"),
+    *("opacityThreshold", "emissiveColor", "normal", "useSpecularWorkflow", "specularColor"),
+    *("displacement", "occlusion", "opacityMode"),
+)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.dictionaries(st.sampled_from(INPUTS), odd_values, max_size=4))
+def test_no_input_of_a_surface_breaks_the_reader(inputs):
+    lines = "\n".join(text.format(f"inputs:{name}") for name, text in inputs.items())
+    material, _ = material_of(square() + preview(lines))
+    material.bsdf_object()
+    if material.emission:
+        mi.load_dict({"type": "area", "radiance": material.emission})
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.dictionaries(
+        st.sampled_from(
+            ("file", "st", "scale", "bias", "fallback", "wrapS", "wrapT", "sourceColorSpace")
+        ),
+        odd_values,
+        max_size=3,
+    )
+)
+def test_no_input_of_a_texture_breaks_the_reader(inputs):
+    lines = "\n".join(text.format(f"inputs:{name}") for name, text in inputs.items())
+    lines = 'uniform token info:id = "UsdUVTexture"\n' + lines
+    node = f'def Shader "t" {{\n{lines}\nfloat3 outputs:rgb\n}}'
+    text = square() + preview(connected("diffuseColor"), node)
+    meshes, _ = meshes_of(stage_of(text))
+    assert len(meshes) == 1
