@@ -503,6 +503,40 @@ def test_periodic_curve_is_a_ring():
     assert area(surface) == pytest.approx(4 * np.pi**2 * 0.01, rel=1e-3)
 
 
+@pytest.mark.parametrize("wrap", ["nonperiodic", "pinned"])
+def test_values_of_several_curves_follow_them(wrap):
+    # Curves of 5, 4 and 5 points along y at x = 0, 1 and 2; widths and colors grow along them
+    counts = [5, 4, 5]
+    places = [(x, y, 0) for x, count in enumerate(counts) for y in range(count)]
+    spans = [count - 1 if wrap == "pinned" else count - 3 for count in counts]
+    varying = [0.1 * (x + 1) for x, span in enumerate(spans) for _ in range(span + 1)]
+    surface = only(f"""def BasisCurves "a" {{
+        uniform token basis = "catmullRom"
+        uniform token wrap = "{wrap}"
+        int[] curveVertexCounts = {counts}
+        point3f[] points = {places}
+        float[] widths = {varying} (
+            interpolation = "varying"
+        )
+        color3f[] primvars:displayColor = [(.1, 0, 0), (.2, 0, 0), (.3, 0, 0)] (
+            interpolation = "uniform"
+        )
+        texCoord2f[] primvars:st = {[place[:2] for place in places]} (
+            interpolation = "vertex"
+        )
+    }}""")
+    sizes = np.linalg.norm(area_vectors(surface), axis=1)
+    for curve, span in enumerate(spans):
+        mine = surface.face_of == curve
+        assert sizes[mine].sum() == pytest.approx(np.pi * 0.1 * (curve + 1) * span, rel=1e-5)
+        vertices = surface.faces[mine]
+        assert surface.colors[vertices][..., 0] == pytest.approx(0.1 * (curve + 1))
+        assert surface.uv[vertices][..., 0] == pytest.approx(curve, abs=1e-6)
+        assert surface.uv[vertices][..., 1] == pytest.approx(
+            surface.positions[vertices][..., 1], abs=1e-5
+        )
+
+
 def test_broken_curves_are_noted():
     surfaces, notes = read("""def BasisCurves "a" {
         int[] curveVertexCounts = [9]
