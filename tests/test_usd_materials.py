@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manylights.usd.geometry import surfaces_of
 from manylights.usd.materials import Materials
-from manylights.usd.mitsuba_meshes import in_world, join, mesh_of
+from manylights.usd.mitsuba_meshes import in_world, join, kind_of, mesh_of
 from manylights.usd.textures import scaled
 from pxr import Usd, UsdUtils
 
@@ -761,6 +761,19 @@ def test_open_pbr_surface_and_its_fallbacks():
     assert material.emission["value"] == [5, 5, 5]
 
 
+def test_unlit_surface_only_emits():
+    inputs = "float inputs:emission = 2\ncolor3f inputs:emission_color = (1, .5, 0)"
+    material, notes = material_of(square() + mtlx("ND_surface_unlit", inputs))
+    assert material.emission["value"] == [2, 1, 0] and not notes
+    assert principled(material)["base_color"]["value"] == [0, 0, 0]
+
+
+def test_black_emissive_images_make_no_lights(tmp_path):
+    write(tmp_path, "i.png", np.zeros((4, 4, 3), dtype=np.uint8))
+    text = square() + preview(connected("emissiveColor"), image_node("i.png"))
+    assert material_of(text, tmp_path)[0].emission is None
+
+
 def test_images_of_material_x(tmp_path):
     quarters(tmp_path)
     nodes = """
@@ -901,16 +914,19 @@ def test_mirrored_lamps_shine_to_their_outside():
 
 def test_joined_surfaces_keep_area_colors_and_places():
     body = 'color3f[] primvars:displayColor = [(.2, .4, .6)] (\ninterpolation = "uniform"\n)'
-    one = only(square(body + ST))
+    stage = stage_of(square(body + ST))
+    context = context_of(stage)
+    one = surfaces_of(stage.GetPrimAtPath("/a"), context)[0]
+    material = Materials(context).of(one)
     shift = np.eye(4)
     shift[0, 3] = 10
-    both = join([one, in_world(one, shift)])
+    other = in_world(one, shift)
+    assert kind_of(one, material) == kind_of(other, material)
+    both = join([one, other], material)
     assert area(both) == pytest.approx(8) and len(both.colors) == 4
     assert both.positions[:, 0].max() == pytest.approx(11)
-    stage = stage_of(square(body + ST))
-    both.binding = stage.GetPrimAtPath("/a")
-    material = Materials(context_of(stage)).of(both)
-    mesh = mesh_of(both, material, context_of(stage), name="both")
+    assert both.uv == pytest.approx(np.concatenate([one.uv, one.uv]))
+    mesh = mesh_of(both, material, context, name="both")
     assert mesh.face_count() == 4 and mesh.id() == "both"
     assert mesh.surface_area() == pytest.approx(8)
 

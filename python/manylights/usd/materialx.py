@@ -174,6 +174,19 @@ def open_pbr(shader, context) -> Look:
     return look
 
 
+def surface_unlit(shader, context) -> Look:
+    """Read an ND_surface_unlit: emission alone."""
+    inputs = _Inputs(shader, context)
+    return Look(
+        base_color=(0.0, 0.0, 0.0),
+        specular_color=(0.0, 0.0, 0.0),
+        opacity=inputs.any("opacity", 1.0),
+        presence=True,
+        emission=inputs.any("emission_color", (1.0, 1.0, 1.0)),
+        emission_weight=inputs.number("emission", 1.0),
+    )
+
+
 def _note_rest(inputs: _Inputs, names) -> None:
     for name in names:
         value = inputs.any(name, 0.0)

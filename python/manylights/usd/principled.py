@@ -109,9 +109,9 @@ class Principled:
         if look.emission_weight <= 0:
             return None
         radiance = self._color(look.emission, look.emission_weight, "emission")
-        if radiance["type"] == "rgb" and not np.any(radiance["value"]):
-            return None
-        return radiance
+        image = radiance.get("nested", radiance).get("bitmap")
+        values = radiance.get("value", (1.0,)) if image is None else np.array(image)
+        return radiance if np.any(values) else None
 
     def _set_reflectance(self, bsdf: dict, look: Look) -> None:
         if look.specular_color is None:
@@ -126,7 +126,7 @@ class Principled:
         if isinstance(part, Lookup):
             if weight != 1:
                 part.scale, part.bias = part.scale * weight, part.bias * weight
-            part, weight = self.textures.make(part, role), 1.0
+            part = self.textures.make(part, role)
         elif isinstance(part, Attribute):
             part = self._attribute(part, "colors", "color")
         if isinstance(part, dict):
@@ -154,11 +154,9 @@ class Principled:
         text = f"the primvar {part.primvar} is not read here, its fallback value is used"
         self.context.notes.add("primvar reader", text, self.prim)
         fallback = (0.0, 0.0, 0.0) if rows == "colors" else 1.0
-        return (
-            fallback
-            if part.fallback is None
-            else like(part.fallback, fallback, self.prim, self.context)
-        )
+        if part.fallback is None:
+            return fallback
+        return like(part.fallback, fallback, self.prim, self.context)
 
     def _gloss(self, roughness):
         """Return Disney's gloss for which alpha is the square of the coat's roughness."""
