@@ -309,20 +309,13 @@ def test_polarizer_before_a_surface_at_brewsters_angle(variant):
     """
     angle = np.arctan(1.5)
     sine, cosine = float(np.sin(angle)), float(np.cos(angle))
+    coat = {"type": "pplastic", "alpha": 0.05, "int_ior": 1.5, "diffuse_reflectance": 0}
 
     def render(theta):
         scene = {
             "type": "scene",
             "lamp": {"type": "point", "position": [-10 * sine, 0, 10 * cosine], "intensity": 100.0},
-            "pane": {
-                "type": "rectangle",
-                "bsdf": {
-                    "type": "pplastic",
-                    "alpha": 0.05,
-                    "int_ior": 1.5,
-                    "diffuse_reflectance": 0,
-                },
-            },
+            "pane": {"type": "rectangle", "bsdf": coat},
             "sensor": camera((10 * sine, 0, 10 * cosine), (0, 0, 0)),
         }
         scene["sensor"]["medium"] = fog("homogeneous", 0.001, None, None)
