@@ -334,9 +334,23 @@ private:
         add_light(row, bounds);
     }
 
+    /// Is a cylinder, whose rays hit what its matrix says, a circular and upright one?
+    static bool is_round(const float m[3][4]) {
+        auto dot = [&](int i, int j) {
+            return m[0][i] * m[0][j] + m[1][i] * m[1][j] + m[2][i] * m[2][j];
+        };
+        constexpr float tolerance = 1e-3f;
+        float square = dot(0, 0), along = std::sqrt(square * dot(2, 2));
+        return std::abs(dot(1, 1) - square) <= tolerance * square &&
+               std::abs(dot(0, 1)) <= tolerance * square &&
+               std::max(std::abs(dot(0, 2)), std::abs(dot(1, 2))) <= tolerance * along;
+    }
+
     void add_cylinder(const Emitter *emitter, const Shape *shape, const Emission &e) {
         float m[3][4];
         read_to_world(shape, m);
+        if (!is_round(m)) // Mitsuba warns of it
+            return add_only_hit();
         LightRow row = make_quadric(LightKind::Cylinder, emitter, shape, e, m);
         float radius = column_length(m, 0), length = column_length(m, 2), center[3];
         for (int i = 0; i < 3; ++i) {
@@ -345,7 +359,9 @@ private:
             center[i]           = m[i][3] + .5f * m[i][2];
         }
         row.geometry[6] = radius;
-        row.geometry[7] = shape->has_flipped_normals() ? -1.f : 1.f;
+        // A mirror turns normals over once, and Mitsuba's mark of it once more
+        bool inwards    = shape->has_flipped_normals() != (determinant(m) < 0);
+        row.geometry[7] = inwards ? -1.f : 1.f;
 
         LightBounds bounds = point_bounds(center);
         for (int i = 0; i < 3; ++i) {
