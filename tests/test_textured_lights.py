@@ -241,7 +241,9 @@ def test_texture_shines_as_its_texels_do(variant, kind, bsdf_samples):
     for index, to_world in enumerate(places(kind)):
         lights[f"lamp_{index}"] = lamp(kind, to_world, bitmap(texels))
         expected = expected + reflected(kind, to_world, lambda u, v: lookup(texels, u, v))
-    pixels = images(lights, 6145, bsdf_samples=bsdf_samples)
+    # Half of a cylinder is unseen: much variance
+    spp = 12289 if kind == "cylinder" else 6145
+    pixels = images(lights, spp, bsdf_samples=bsdf_samples)
     assert_mean(pixels, expected, kind)
     with pytest.raises(AssertionError, match="not"):
         assert_mean(pixels * (1 + tools.BIAS), expected, kind)

@@ -108,6 +108,7 @@ private:
     template <typename F> std::vector<float> evaluate(size_t count, const F &uv) const {
         std::vector<float> result(count);
         if constexpr (dr::is_jit_v<Float>) {
+            dr::suspend_grad<Float> detached;
             std::vector<float> u(count), v(count);
             for (size_t i = 0; i < count; ++i) {
                 Point2 point = uv(i);
