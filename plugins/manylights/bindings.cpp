@@ -5,6 +5,7 @@
  * Lights are numbered as in the input, whatever order the tree gives them.
  */
 
+#include "brightness_map.h"
 #include "reservoirs.h"
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -247,6 +248,30 @@ Choices resample(const Numbers &importance, const Numbers &probability,
     return result;
 }
 
+using Image = nb::ndarray<const float, nb::shape<-1, -1>, nb::c_contig, nb::device::cpu>;
+using Corners =
+    nb::ndarray<const double, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+
+BrightnessMap brightness_map(const Image &image, const std::string &wrap) {
+    if (image.size() == 0 || (wrap != "repeat" && wrap != "mirror" && wrap != "clamp"))
+        throw nb::value_error("an image has texels, and wrap is repeat, mirror or clamp");
+    return { image.shape(1), image.shape(0),
+             std::vector<float>(image.data(), image.data() + image.size()),
+             wrap == "repeat"   ? Wrap::Repeat
+             : wrap == "mirror" ? Wrap::Mirror
+                                : Wrap::Clamp };
+}
+
+float mean_brightness(const BrightnessMap &map, const Corners &corners) {
+    size_t count = corners.shape(0);
+    if (count != 3 && count != 4)
+        throw nb::value_error("corners must be those of a triangle or quadrilateral");
+    Point2 polygon[4];
+    for (size_t i = 0; i < count; ++i)
+        polygon[i] = { corners(i, 0), corners(i, 1) };
+    return map.mean(polygon, count);
+}
+
 } // namespace
 
 NB_MODULE(_core, m) {
@@ -281,6 +306,19 @@ NB_MODULE(_core, m) {
         .def_prop_ro("node_links", &Tree::node_links,
                      "4 * parent + slot of each 4-wide node.")
         .def_prop_ro("binary_nodes", &Tree::binary_nodes, "The binary nodes as bytes.");
+    nb::class_<BrightnessMap>(m, "BrightnessMap",
+                              "Brightness (H, W) of an image that covers the plane; "
+                              "wrap: repeat, mirror, clamp.")
+        .def(
+            "__init__",
+            [](BrightnessMap *self, const Image &image, const std::string &wrap) {
+                new (self) BrightnessMap(brightness_map(image, wrap));
+            },
+            "image"_a, "wrap"_a = "repeat")
+        .def("mean", &mean_brightness, "corners"_a,
+             "Mean over a triangle (3, 2) or convex quadrilateral (4, 2); the image is "
+             "the "
+             "unit square.");
     m.def("select", &select_items, "targets"_a, "picks"_a, "offset"_a,
           "Threshold-systematic selection: chosen items, and weights max(1, tau / "
           "target).");

@@ -804,7 +804,7 @@ private:
                     UnpolarizedSpectrum(Float(row[kBrightness])));
             else
                 m_emission.add_masked(emission, eval, [&](Mask m) {
-                    return m_emission.triangle_emission(from, row, point, d, m);
+                    return m_emission.emission_by_emitter(from, row, point, d, m);
                 });
         }
         bool delta_only = !m_lights.can_be_hit();

@@ -46,8 +46,8 @@ constexpr uint32_t kOnlyHit = 0xfffffffeu;
  * variants; in spectral ones it is scale * D65(lambda) * S(color, lambda), with S
  * Mitsuba's sigmoid upsampling of the coefficients `color`. A row that is not
  * `tabulated` has its emission evaluated by its emitter; `color[0]` then holds the bits
- * of the triangle's index and `color[1]` is 1 if its two edges were swapped to make it emit
- * to the right side, 0 if not. A triangle with smooth normals is sampled on both sides
+ * of the triangle's index (0 for other shapes) and `color[1]` is 1 if its two edges, or the
+ * axes of a disk, were swapped to make it emit to the right side, 0 if not. A triangle with smooth normals is sampled on both sides
  * (kTagTwoSided), since the side on which it emits changes from point to point.
  */
 struct LightRow {

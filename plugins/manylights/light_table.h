@@ -5,9 +5,10 @@
  *
  * Points, spots and area emitters of constant radiance become rows that the kernels can
  * evaluate without a virtual call; each triangle of an emissive mesh is a light of its
- * own. Textured radiance is integrated over each triangle by quadrature at the density of
- * its texels. Other emitters of finite extent (projectors, textured or exotic shapes) are
- * one light each, sampled through their own plugin after they were selected. Emitters at
+ * own. Of radiance that varies, the table has the mean over the triangle, sphere, disk or
+ * cylinder; the emitter evaluates it at the point that was chosen. Other emitters of finite
+ * extent (projectors, exotic shapes) are one light each, sampled through their own plugin
+ * after they were selected. Emitters at
  * infinity stay out of the table, and so do those without power.
  *
  * Emitters and textures are read through Mitsuba's traversal interface, since the classes
@@ -18,10 +19,12 @@
 #include "importance.h"
 #include "light_flux.h"
 #include "mesh_emission.h"
+#include "quadric_emission.h"
 #include <cstring>
 #include <mitsuba/core/logger.h>
 #include <mitsuba/core/qmc.h>
 #include <mitsuba/render/scene.h>
+#include <unordered_map>
 
 namespace manylights {
 
@@ -234,14 +237,12 @@ private:
         } else {
             std::string_view name = shape->class_name();
             uint32_t light        = (uint32_t) m_table.rows.size();
-            if (!known || !e.tabulated)
-                add_other(emitter);
-            else if (name == "Sphere")
-                add_sphere(shape, e);
-            else if (name == "Disk")
-                add_disk(shape, e);
-            else if (name == "Cylinder")
-                add_cylinder(shape, e);
+            if (known && name == "Sphere")
+                add_sphere(emitter, shape, e);
+            else if (known && name == "Disk")
+                add_disk(emitter, shape, e);
+            else if (known && name == "Cylinder")
+                add_cylinder(emitter, shape, e);
             else
                 add_other(emitter);
             push_primitive(light);
@@ -274,10 +275,32 @@ private:
                m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
     }
 
-    void add_sphere(const Shape *shape, const Emission &e) {
+    /// The bitmap that makes an emitter shine, read at first use; null if it is something else
+    const TextureImage<Float, Spectrum> *shown_image(const Emitter *emitter) {
+        const mitsuba::Object *radiance = ParameterReader(emitter).object("radiance");
+        auto [entry, added]             = m_images.try_emplace(radiance);
+        if (added)
+            entry->second = TextureImage<Float, Spectrum>::read(radiance);
+        return entry->second.get();
+    }
+
+    /// A sphere, disk or cylinder; its emission is not in the row if it varies
+    LightRow make_quadric(LightKind kind, const Emitter *emitter, const Shape *shape,
+                          Emission e, const float (&to_world)[3][4]) {
+        if (!e.tabulated)
+            e.brightness =
+                QuadricEmission<Float, Spectrum>(emitter, shape, kind, to_world)
+                    .brightness(shown_image(emitter));
+        LightRow row = make_row(kind, e);
+        if (!e.tabulated)
+            set_primitive(row, 0, false);
+        return row;
+    }
+
+    void add_sphere(const Emitter *emitter, const Shape *shape, const Emission &e) {
         float m[3][4];
         read_to_world(shape, m);
-        LightRow row = make_row(LightKind::Sphere, e);
+        LightRow row = make_quadric(LightKind::Sphere, emitter, shape, e, m);
         float radius = column_length(m, 0);
         for (int i = 0; i < 3; ++i)
             row.geometry[i] = m[i][3];
@@ -290,12 +313,14 @@ private:
         add_light(row, bounds);
     }
 
-    void add_disk(const Shape *shape, const Emission &e) {
+    void add_disk(const Emitter *emitter, const Shape *shape, const Emission &e) {
         float m[3][4];
         read_to_world(shape, m);
-        LightRow row = make_row(LightKind::Disk, e);
         // A mirrored disk keeps its normal: swap the axes instead
-        int u = determinant(m) < 0 ? 1 : 0;
+        int u        = determinant(m) < 0 ? 1 : 0;
+        LightRow row = make_quadric(LightKind::Disk, emitter, shape, e, m);
+        if (!e.tabulated)
+            set_primitive(row, 0, u == 1);
         for (int i = 0; i < 3; ++i) {
             row.geometry[i]     = m[i][3];
             row.geometry[3 + i] = m[i][u];
@@ -309,10 +334,24 @@ private:
         add_light(row, bounds);
     }
 
-    void add_cylinder(const Shape *shape, const Emission &e) {
+    /// Is a cylinder, whose rays hit what its matrix says, a circular and upright one?
+    static bool is_round(const float m[3][4]) {
+        auto dot = [&](int i, int j) {
+            return m[0][i] * m[0][j] + m[1][i] * m[1][j] + m[2][i] * m[2][j];
+        };
+        constexpr float tolerance = 1e-3f;
+        float square = dot(0, 0), along = std::sqrt(square * dot(2, 2));
+        return std::abs(dot(1, 1) - square) <= tolerance * square &&
+               std::abs(dot(0, 1)) <= tolerance * square &&
+               std::max(std::abs(dot(0, 2)), std::abs(dot(1, 2))) <= tolerance * along;
+    }
+
+    void add_cylinder(const Emitter *emitter, const Shape *shape, const Emission &e) {
         float m[3][4];
         read_to_world(shape, m);
-        LightRow row = make_row(LightKind::Cylinder, e);
+        if (!is_round(m)) // Mitsuba warns of it
+            return add_only_hit();
+        LightRow row = make_quadric(LightKind::Cylinder, emitter, shape, e, m);
         float radius = column_length(m, 0), length = column_length(m, 2), center[3];
         for (int i = 0; i < 3; ++i) {
             row.geometry[i]     = m[i][3];
@@ -320,7 +359,9 @@ private:
             center[i]           = m[i][3] + .5f * m[i][2];
         }
         row.geometry[6] = radius;
-        row.geometry[7] = shape->has_flipped_normals() ? -1.f : 1.f;
+        // A mirror turns normals over once, and Mitsuba's mark of it once more
+        bool inwards    = shape->has_flipped_normals() != (determinant(m) < 0);
+        row.geometry[7] = inwards ? -1.f : 1.f;
 
         LightBounds bounds = point_bounds(center);
         for (int i = 0; i < 3; ++i) {
@@ -340,7 +381,8 @@ private:
         HostView faces(mesh->faces_buffer());
         std::vector<Emission> varying;
         if (!constant.tabulated)
-            varying = MeshEmission<Float, Spectrum>(emitter, mesh).read();
+            varying =
+                MeshEmission<Float, Spectrum>(emitter, mesh, shown_image(emitter)).read();
         bool flipped = mesh->has_flipped_normals();
         add_triangles(faces.size() / 3, [&](size_t f, LightRow &row,
                                             LightBounds &bounds) {
@@ -473,10 +515,14 @@ private:
             row.tag |= kTagTwoSided;
             std::fill_n(bounds.axis, 3, 0.f);
         }
-        if (!e.tabulated) {
-            std::memcpy(&row.color[0], &face_index, sizeof(float));
-            row.color[1] = flip ? 1.f : 0.f;
-        }
+        if (!e.tabulated)
+            set_primitive(row, face_index, flip);
+    }
+
+    /// For lights that their emitter evaluates: which primitive, and are its edges swapped?
+    static void set_primitive(LightRow &row, uint32_t index, bool swapped) {
+        std::memcpy(&row.color[0], &index, sizeof(float));
+        row.color[1] = swapped ? 1.f : 0.f;
     }
 
     // --------------------------------------------------------------- Anything else
@@ -679,7 +725,8 @@ private:
             m_only_hit = by_plugin; // black as far as the quadrature saw
             return;
         }
-        m_table.proportional[m_emitter] = kind != LightKind::Other;
+        m_table.proportional[m_emitter] =
+            kind != LightKind::Other && (row.tag & kTagTabulated);
         m_table.beams |= kind == LightKind::Spot && row.geometry[6] < kWidestBeam;
         m_table.kinds.insert(kind);
         m_table.rows.push_back(row);
@@ -691,6 +738,10 @@ private:
 
     const Scene *m_scene = nullptr;
     Table m_table;
+    /// Bitmaps that emit, by their texture; null for other textures
+    std::unordered_map<const mitsuba::Object *,
+                       std::unique_ptr<TextureImage<Float, Spectrum>>>
+        m_images;
     /// Index of the emitter that is being read; did its last light turn out to be unsampled?
     uint32_t m_emitter = 0;
     bool m_only_hit    = false;

@@ -1,7 +1,7 @@
 #pragma once
 
 /**
- * What the lights of a scene emit: radiance of a row of the table, of a triangle whose
+ * What the lights of a scene emit: radiance of a row of the table, of a surface whose
  * radiance varies, and of whatever a ray has hit.
  */
 
@@ -124,21 +124,23 @@ public:
         }
     }
 
-    /// Radiance of a triangle whose emission varies, from its emitter
-    MI_NOINLINE Spectrum triangle_emission(const Interaction3f &from,
-                                           const Row<FloatD> &row,
-                                           const LightPoint<FloatD> &point,
-                                           const Vector3f &d, Mask active) const {
+    /// Radiance at a point of a light that is not tabulated (any kind but `Other`), from its
+    /// emitter
+    MI_NOINLINE Spectrum emission_by_emitter(const Interaction3f &from,
+                                             const Row<FloatD> &row,
+                                             const LightPoint<FloatD> &point,
+                                             const Vector3f &d, Mask active) const {
         EmitterPtr emitter           = emitter_of(row);
         PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        MaskD flipped                = row[kColor + 1] > 0.f;
+        MaskD swapped                = row[kColor + 1] > 0.f;
         pi.valid                     = active;
-        pi.t                         = dr::norm(Point3f(point.p) - from.p);
-        pi.prim_uv    = Point2f(dr::select(flipped, point.uv.y(), point.uv.x()),
-                                dr::select(flipped, point.uv.x(), point.uv.y()));
+        // From close by: a small shape far away is still hit where the point is
+        pi.t          = dr::norm(Point3f(point.p) - from.p) * (1.f / 1024.f);
+        pi.prim_uv    = Point2f(dr::select(swapped, point.uv.y(), point.uv.x()),
+                                dr::select(swapped, point.uv.x(), point.uv.y()));
         pi.prim_index = row.bits(kColor);
         pi.shape      = emitter->shape();
-        Ray3f ray(from.p, d, from.time, from.wavelengths);
+        Ray3f ray(Point3f(point.p) - d * pi.t, d, from.time, from.wavelengths);
         SurfaceInteraction3f si =
             pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, active);
         return emitter->eval(si, active);
