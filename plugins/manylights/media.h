@@ -10,6 +10,7 @@
  */
 
 #include "loop.h"
+#include "scene_shapes.h"
 #include <drjit/random.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/medium.h>
@@ -35,13 +36,13 @@ public:
     MI_IMPORT_TYPES(Scene, Sampler, BSDFPtr, MediumPtr)
     using Rng = dr::PCG32<dr::uint32_array_t<dr::detached_t<Float>>>;
 
-    /// The media of the scene's shapes and sensors. Shapes within groups cannot be asked.
+    /// The media of the scene's shapes, within groups, too, and of its sensors
     static MediaKinds find(const Scene *scene) {
         MediaKinds kinds;
-        for (const auto &shape : scene->shapes()) {
+        for_each_shape(scene, [&](const auto *shape) {
             kinds.add(shape->interior_medium());
             kinds.add(shape->exterior_medium());
-        }
+        });
         for (const auto &sensor : scene->sensors())
             kinds.add(sensor->medium());
         return kinds;
