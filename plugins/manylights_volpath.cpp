@@ -158,14 +158,17 @@ public:
                                      const RayDifferential3f &ray, const Medium *medium,
                                      Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
-        const auto &lights           = m_cache.get(scene, sampler);
-        manylights::MediaKinds media = lights.media();
+        auto lights                  = m_cache.get(scene, sampler);
+        manylights::MediaKinds media = (*lights).media();
         media.add(medium);
-        PathTracer tracer(scene, lights, media, m_params,
+        PathTracer tracer(scene, *lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;
-        auto result = manylights::call_flat<Float>(
-            [&] { return tracer.trace(sampler, Ray3f(ray), medium, counts, active); });
+        auto result = manylights::differentiable<Float>(sampler, [&] {
+            return manylights::call_flat<Float>([&] {
+                return tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+            });
+        });
         if (m_params.counts)
             counts.write(aovs, m_params);
         return result;
