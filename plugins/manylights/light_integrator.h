@@ -7,6 +7,7 @@
 
 #include "light_cache.h"
 #include "parameters.h"
+#include "passes.h"
 #include <drjit/morton.h>
 #include <drjit/packet.h>
 #include <mitsuba/core/progress.h>
@@ -27,6 +28,7 @@ public:
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Film, ImageBlock)
     using Cache  = LightCache<Float, Spectrum>;
     using Lights = typename Cache::Lights;
+    using Pass   = manylights::Pass<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
         : Base(props), m_params(params), m_cache(params.splits_nodes()) {}
@@ -215,53 +217,6 @@ private:
         uint32_t m_training;
     };
 
-    /// How a sampler's numbers belong together
-    struct SamplerKind {
-        /// Any number of them can be drawn in any order
-        bool independent;
-        /// All of a pixel's samples form a pattern, which depends on the seed
-        bool pattern;
-
-        explicit SamplerKind(const Sampler *sampler) {
-            std::string_view name = sampler->class_name();
-            independent           = name == "IndependentSampler";
-            pattern = name == "StratifiedSampler" || name == "MultijitterSampler" ||
-                      name == "OrthogonalSampler" || name == "LowDiscrepancySampler";
-        }
-    };
-
-    /// Some of each pixel's samples, from number `first` on
-    struct Pass {
-        uint32_t first, samples;
-        UInt32 seed;
-        SamplerKind sampler;
-
-        /// The first pass has the seed of the rendering, and so have all that share a pattern
-        Pass(const UInt32 &rendering, uint32_t number, uint32_t first, uint32_t samples,
-             const Sampler *sampler)
-            : first(first), samples(samples), seed(rendering), sampler(sampler) {
-            if (number > 0 && !this->sampler.pattern)
-                seed = mitsuba::sample_tea_32(rendering, UInt32(number)).first;
-        }
-    };
-
-    /// The number of samples that a sampler had is its own again at the end, however that comes
-    class SampleCount {
-    public:
-        explicit SampleCount(Sampler *sampler)
-            : m_sampler(sampler), m_count(sampler->sample_count()) {}
-        ~SampleCount() {
-            m_sampler->set_sample_count(m_count);
-            if constexpr (dr::is_jit_v<Float>)
-                m_sampler->set_samples_per_wavefront(m_count);
-        }
-        SampleCount(const SampleCount &) = delete;
-
-    private:
-        Sampler *m_sampler;
-        uint32_t m_count;
-    };
-
     /// Mitsuba's passes are all of one size, those of \ref Learning are not
     TensorXf render_passes(Learning &learning, Scene *scene, Sensor *sensor,
                            const UInt32 &seed, bool develop, bool evaluate) {
@@ -382,47 +337,7 @@ private:
         }
     }
 
-    /// Go to the first sample of a pass. The random numbers within strata begin where those of
-    /// the first pass began: some are left out, so that none has the same use again.
-    static void skip(Sampler *sampler, const Pass &pass) {
-        constexpr uint32_t left_out = 5;
-        for (uint32_t i = 0; pass.first > 0 && i < left_out; ++i)
-            sampler->next_1d(true);
-        for (uint32_t i = 0; i < pass.first; ++i)
-            sampler->advance();
-    }
-
     // --------------------------------------------------------------------------- JIT variants
-
-    /// How samples lie in a wavefront: blocks of lanes hold whole pixels, and some lanes may be
-    /// left over
-    struct Wavefront {
-        /// Lanes of a block, pixels therein, and lanes of each pixel
-        uint32_t block, pixels, samples;
-
-        uint32_t size(uint32_t pixel_count) const {
-            return (pixel_count + pixels - 1) / pixels * block;
-        }
-    };
-
-    /**
-     * Of the independent sampler, any number of samples. No pixel is split between threads, or
-     * warps that are not full, whose sums would depend on which of them came first, unless more
-     * than an eighth of the lanes would be left over. Of others, all up to the last one of the pass,
-     * if their number divides the whole, or else all samples; those before the pass are masked.
-     */
-    static Wavefront wavefront(const Pass &pass, uint32_t spp) {
-        uint32_t block = dr::is_cuda_v<Float> ? 32 : jit_llvm_block_size();
-        block = std::max(block, mitsuba::math::round_to_power_of_two(pass.samples));
-        uint32_t lanes = pass.samples;
-        if (pass.sampler.independent && block % lanes <= block / 8)
-            return { block, block / lanes, lanes };
-        if (!pass.sampler.independent) {
-            lanes += pass.first;
-            lanes = spp % lanes == 0 ? lanes : spp;
-        }
-        return { lanes, 1, lanes };
-    }
 
     void render_wavefront(Scene *scene, Sensor *sensor, size_t channels,
                           const Pass &pass) {
@@ -441,7 +356,7 @@ private:
         Mask active     = local < dr::opaque<UInt32>(lanes.pixels) &&
                           pixel < dr::prod(size) && j >= dr::opaque<UInt32>(masked);
 
-        SampleCount guard(sampler);
+        SampleCount<Float, Spectrum> guard(sampler);
         if (pass.sampler.independent)
             sampler->set_sample_count(lanes.samples);
         sampler->set_samples_per_wavefront(lanes.samples);
