@@ -174,9 +174,12 @@ public:
                                      const RayDifferential3f &ray, const Medium *,
                                      Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
-        DirectLight direct(scene, m_cache.get(scene, sampler), m_params);
-        return manylights::call_flat<Float>(
-            [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
+        auto lights = m_cache.get(scene, sampler);
+        DirectLight direct(scene, *lights, m_params);
+        return manylights::differentiable<Float>(sampler, [&] {
+            return manylights::call_flat<Float>(
+                [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
+        });
     }
 
     /// Radiance along a ray, and whether it met anything

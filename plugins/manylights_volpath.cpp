@@ -123,8 +123,7 @@ densities: no weight exceeds the number of channels.
 
 .. note:: Gradients of BSDFs, media and emitters flow through :code:`mi.render` in the
    :code:`ad` variants; positions of lights are not differentiated. In JIT variants this
-   integrator refuses to be recorded by :code:`dr.freeze`. Media of shapes inside of a shape
-   group are noticed only if the scene has others, too.
+   integrator refuses to be recorded by :code:`dr.freeze`.
 
 .. tabs::
     .. code-tab::  xml
@@ -159,13 +158,16 @@ public:
                                      const RayDifferential3f &ray, const Medium *medium,
                                      Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
-        const auto &lights = m_cache.get(scene, sampler);
-        auto media         = Media::with(lights.media(), scene, medium);
-        PathTracer tracer(scene, lights, media, m_params,
+        auto lights = m_cache.get(scene, sampler);
+        auto media  = Media::with((*lights).media(), scene, medium);
+        PathTracer tracer(scene, *lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;
-        auto result = manylights::call_flat<Float>(
-            [&] { return tracer.trace(sampler, Ray3f(ray), medium, counts, active); });
+        auto result = manylights::differentiable<Float>(sampler, [&] {
+            return manylights::call_flat<Float>([&] {
+                return tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+            });
+        });
         if (m_params.counts)
             counts.write(aovs, m_params);
         return result;

@@ -167,31 +167,28 @@ public:
 
     /// Radiance that arrives along rays sampled from the BSDF
     Spectrum sample_bsdf(const Vertex &vertex, Sampler *sampler, Mask active) const {
-        const SurfaceInteraction3f &si = vertex.si;
-        mitsuba::BSDFContext ctx;
         Spectrum result(0.f);
-        for (uint32_t i = 0; i < m_params.bsdf_samples; ++i) {
-            auto [bs, value] = vertex.bsdf->sample(ctx, si, sampler->next_1d(active),
-                                                   sampler->next_2d(active), active);
-            value            = si.to_world_mueller(value, -bs.wo, si.wi);
-            Mask active_b =
-                active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
-            SurfaceInteraction3f hit;
-            auto [light, emits] =
-                m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), hit, active_b);
-            if (dr::none_or<false>(emits))
-                continue;
-            Spectrum radiance = m_emission.emitted(hit, light, active_b);
-
-            Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
-            Float light_pdf = dr::select(delta, 0.f,
-                                         hit_density(vertex.at, vertex.u.tree, true, hit,
-                                                     light, active_b && !delta));
-            Float pdf       = bs.pdf * (float) m_params.bsdf_samples;
-            result[active_b] += value * radiance * mis_weight<Float>(pdf, light_pdf) /
-                                (float) m_params.bsdf_samples;
+        if (m_params.bsdf_samples <= kUnrolledRays) {
+            for (uint32_t i = 0; i < m_params.bsdf_samples; ++i)
+                add_bsdf_sample(vertex, sampler, result, active);
+            return result;
         }
-        return result;
+        struct State {
+            UInt32 ray;
+            Spectrum result;
+            Sampler *sampler;
+            DRJIT_STRUCT(State, ray, result, sampler)
+        };
+        State state{ UInt32(0), result, sampler };
+        UInt32 rays = dr::opaque<UInt32>(m_params.bsdf_samples);
+        loop(
+            state, [&](const State &s) { return active && s.ray < rays; },
+            [&](State &s) {
+                add_bsdf_sample(vertex, s.sampler, s.result, active);
+                s.ray += 1u;
+            },
+            "Direct light: rays from the BSDF");
+        return state.result;
     }
 
     /**
@@ -246,6 +243,35 @@ public:
     }
 
 private:
+    /// More rays from the BSDF are a recorded loop
+    static constexpr uint32_t kUnrolledRays = 4;
+
+    void add_bsdf_sample(const Vertex &vertex, Sampler *sampler, Spectrum &result,
+                         Mask active) const {
+        const SurfaceInteraction3f &si = vertex.si;
+        mitsuba::BSDFContext ctx;
+        // In this order with all compilers
+        Point2f u2       = sampler->next_2d(active);
+        Float u1         = sampler->next_1d(active);
+        auto [bs, value] = vertex.bsdf->sample(ctx, si, u1, u2, active);
+        value            = si.to_world_mueller(value, -bs.wo, si.wi);
+        Mask reflected   = active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
+        SurfaceInteraction3f hit;
+        auto [light, emits] =
+            m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), hit, reflected);
+        if (dr::none_or<false>(emits))
+            return;
+        Spectrum radiance = m_emission.emitted(hit, light, reflected);
+
+        Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
+        Float light_pdf = dr::select(
+            delta, 0.f,
+            hit_density(vertex.at, vertex.u.tree, true, hit, light, reflected && !delta));
+        Float pdf = bs.pdf * (float) m_params.bsdf_samples;
+        result[reflected] += value * radiance * mis_weight<Float>(pdf, light_pdf) /
+                             (float) m_params.bsdf_samples;
+    }
+
     using Sample          = RaySample<Float, Spectrum, mitsuba::is_polarized_v<Spectrum>>;
     using InfiniteSamples = std::array<Sample, kMaxInfinite>;
     using KeptSamples =
@@ -759,9 +785,8 @@ private:
         if (others) {
             other &= active;
             if (target_only) {
-                constexpr float typical_bsdf = .2f;
                 Float guess = Float(light_importance(vertex.at, row, kinds)) *
-                              (vertex.at.lobes == Lobes::None ? typical_bsdf : 1.f);
+                              (vertex.at.lobes == Lobes::None ? kTypicalBsdf : 1.f);
                 dr::masked(result, other) = Sample::make(
                     Spectrum(1.f),
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess)),

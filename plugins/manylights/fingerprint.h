@@ -65,6 +65,15 @@ public:
     /// What an emitter emits, and everything else about it
     struct Parts {
         Hash emission, place;
+        /// Has what it emits a gradient?
+        bool differentiated = false;
+    };
+
+    /// An emitter that emits something else
+    struct Change {
+        uint32_t emitter;
+        /// Has that a gradient, and what it emitted before?
+        bool differentiated, was_differentiated;
     };
 
     explicit Fingerprint(size_t emitters) { m_emitters.reserve(emitters); }
@@ -81,9 +90,15 @@ public:
 
     /// Go on with the next emitter
     void add_emitter(const Object *emitter) {
+        add_untouched(emitter);
+        add(emitter);
+    }
+
+    /// The same for one whose parameters do not matter
+    void add_untouched(const Object *emitter) {
         m_emitters.emplace_back();
         m_hash = &m_emitters.back().place;
-        add(emitter);
+        mix((uint64_t) emitter);
     }
 
     /// Mix in an object on which the current emitter depends
@@ -131,12 +146,15 @@ public:
         return same;
     }
 
-    /// Emitters that emit something else
-    std::vector<uint32_t> changed_emission(const Fingerprint &other) const {
-        std::vector<uint32_t> result;
-        for (size_t i = 0; i < m_emitters.size(); ++i)
-            if (m_emitters[i].emission.value != other.m_emitters[i].emission.value)
-                result.push_back((uint32_t) i);
+    /// Emitters that emit something else than in `other`
+    std::vector<Change> changed_emission(const Fingerprint &other) const {
+        std::vector<Change> result;
+        for (size_t i = 0; i < m_emitters.size(); ++i) {
+            const Parts &now = m_emitters[i], &before = other.m_emitters[i];
+            if (now.emission.value != before.emission.value)
+                result.push_back(
+                    { (uint32_t) i, now.differentiated, before.differentiated });
+        }
         return result;
     }
 
@@ -154,6 +172,9 @@ private:
     static void mix_variable(void *self, uint64_t index, const char *, const char *) {
         Fingerprint &out = *(Fingerprint *) self;
         out.mix(index);
+        Parts *parts = out.m_emitters.empty() ? nullptr : &out.m_emitters.back();
+        if (parts && out.m_hash == &parts->emission)
+            parts->differentiated |= (index >> 32) != 0;
         if ((uint32_t) index)
             out.m_variables.push_back((uint32_t) index);
     }

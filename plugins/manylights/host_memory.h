@@ -9,6 +9,7 @@
 #include <cstdint>
 #include <drjit/packet.h>
 #include <memory>
+#include <mutex>
 #include <nanothread/nanothread.h>
 #include <utility>
 #include <vector>
@@ -34,6 +35,8 @@ template <typename T> using HostVector = std::vector<T, UninitializedAllocator<T
  */
 inline Pool *own_threads() {
     static Pool *pool = pool_create(pool_size(nullptr));
+    static std::mutex mutex;
+    std::lock_guard<std::mutex> guard(mutex);
     if (uint32_t size = pool_size(nullptr); pool_size(pool) != size)
         pool_set_size(pool, size);
     return pool;

@@ -86,6 +86,8 @@ Value attenuation(const Receiver<Float> &at, const Value &distance) {
     return dr::maximum(dr::exp(-distance * at.extinction), kTransmittanceFloor);
 }
 
+/// What a BSDF without a lobe is taken to be
+constexpr float kTypicalBsdf = .2f;
 /// Share of its peak that a lobe has everywhere: for what one lobe does not tell of a BSDF
 constexpr float kLobeFloor = .0003f;
 /// The same of a lobe of transmission, whose peak can be much higher: times beta^2

@@ -6,19 +6,23 @@
  * some emitters has changed, the tree stays and gets new fluxes.
  *
  * Mitsuba has no hook before rendering. `render()` holds a \ref Rendering, which compares a
- * fingerprint of the emitters once. Other integrators (`moment`, `stokes`) call `sample()`
- * alone: then the fingerprint is taken there, once for each recording in JIT variants, and in
- * scalar ones whenever a thread comes with another sampler, which it does for each of its
- * parts of an image.
+ * fingerprint of the emitters once. Otherwise it is compared whenever `sample()` is called:
+ * once for each recording in JIT variants. In scalar ones, where that would be once for each
+ * ray of an integrator around this one (`moment`, `stokes`), only when a thread comes with
+ * another sampler. Such renderings fork one for each part of an image; the sampler of a
+ * program, which may change the scene between two calls, is known by belonging to Python.
  */
 
 #include "scene_lights.h"
 #include <atomic>
+#include <memory>
 #include <mitsuba/core/logger.h>
 #include <mitsuba/core/util.h>
 #include <mitsuba/render/sampler.h>
 #include <mutex>
 #include <sstream>
+#include <thread>
+#include <unordered_map>
 
 namespace manylights {
 
@@ -31,13 +35,19 @@ public:
     explicit LightCache(bool keep_binary) : m_keep_binary(keep_binary) {}
 
 private:
+    /// The lights of a scene as it was; those who use them keep it
     struct Entry {
         const Scene *scene;
         Fingerprint<Float> fingerprint;
         mitsuba::ref<Lights> lights;
         /// How many calls of `render()` have checked these lights and go on
-        std::atomic<uint32_t> renderings{ 0 };
+        uint32_t renderings = 0;
+
+        Entry(const Scene *scene, Fingerprint<Float> &&fingerprint,
+              mitsuba::ref<Lights> lights)
+            : scene(scene), fingerprint(std::move(fingerprint)), lights(lights) {}
     };
+    using EntryPtr = std::shared_ptr<Entry>;
 
 public:
     /// Brings the lights of a scene up to date and vouches for them while it lives. There
@@ -46,14 +56,12 @@ public:
     public:
         Rendering(const LightCache &cache, const Scene *scene) : m_cache(cache) {
             std::lock_guard<std::mutex> guard(cache.m_mutex);
-            m_entry = &cache.update(scene);
+            m_entry = cache.update(scene);
             ++m_entry->renderings;
-            ++cache.m_renderings;
         }
         ~Rendering() {
             std::lock_guard<std::mutex> guard(m_cache.m_mutex);
             --m_entry->renderings;
-            --m_cache.m_renderings;
         }
         Rendering(const Rendering &) = delete;
 
@@ -61,33 +69,43 @@ public:
 
     private:
         const LightCache &m_cache;
-        Entry *m_entry;
+        EntryPtr m_entry;
+    };
+
+    /// Lights in use, kept alive if nobody else does
+    class Use {
+    public:
+        explicit Use(const Lights *lights) : m_lights(lights) {}
+        explicit Use(const mitsuba::ref<Lights> &lights)
+            : m_lights(lights.get()), m_kept(lights) {}
+        const Lights &operator*() const { return *m_lights; }
+
+    private:
+        const Lights *m_lights;
+        mitsuba::ref<Lights> m_kept;
     };
 
     /// The lights of a scene, for `sample()`; cheap enough for every ray
-    const Lights &get(const Scene *scene, const Sampler *sampler) const {
-        const Entry *current = m_current.load(std::memory_order_acquire);
-        if (current && current->scene == scene && current->renderings > 0)
-            return *current->lights;
-        if constexpr (dr::is_jit_v<Float>) {
-            (void) sampler;
-            std::lock_guard<std::mutex> guard(m_mutex);
-            return *update(scene).lights;
-        } else {
+    Use get(const Scene *scene, const Sampler *sampler) const {
+        if constexpr (!dr::is_jit_v<Float>) {
             thread_local Visit last;
-            if (!last.is(this, scene, sampler)) {
-                std::lock_guard<std::mutex> guard(m_mutex);
-                last.set(this, scene, sampler, *update(scene).lights);
+            if (last.is(m_serial, scene, sampler))
+                return Use(last.lights);
+            if (!sampler->self_py()) {
+                last = visit(scene, sampler);
+                return Use(last.lights);
             }
-            return *last.lights;
         }
+        std::lock_guard<std::mutex> guard(m_mutex);
+        return Use(vouched_or_updated(scene)->lights);
     }
 
     /// Expose the size of the current tree, read-only
     void traverse(mitsuba::TraversalCallback *cb) {
         auto read_only = mitsuba::ParamFlags::ReadOnly;
-        if (const Entry *current = m_current.load())
-            m_statistics = current->lights->statistics();
+        std::lock_guard<std::mutex> guard(m_mutex);
+        if (m_current)
+            m_statistics = m_current->lights->statistics();
         cb->put("lights", m_statistics.lights, read_only);
         cb->put("lights_in_tree", m_statistics.lights_in_tree, read_only);
         cb->put("nodes", m_statistics.nodes, read_only);
@@ -97,48 +115,53 @@ public:
     }
 
     std::string to_string() const {
-        const Entry *current = m_current.load();
-        return current ? describe(current->lights->statistics()) : "[not built yet]";
+        std::lock_guard<std::mutex> guard(m_mutex);
+        return m_current ? describe(m_current->lights->statistics()) : "[not built yet]";
     }
 
 private:
     using Statistics = typename Lights::Statistics;
 
-    /// What a thread saw last. It keeps the sampler and the lights, so that no other can get
-    /// their addresses; the references left at the end of a thread are not given back, since
-    /// the thread may outlive this library.
+    /// What a thread saw last. The cache of this number keeps sampler and lights, so that no
+    /// others can get their addresses. Threads outlive caches, and keep nothing of them.
     struct Visit {
-        const LightCache *cache = nullptr;
-        const Scene *scene      = nullptr;
-        const Sampler *sampler  = nullptr;
-        const Lights *lights    = nullptr;
+        uint64_t cache         = 0;
+        const Scene *scene     = nullptr;
+        const Sampler *sampler = nullptr;
+        const Lights *lights   = nullptr;
 
-        bool is(const LightCache *c, const Scene *sc, const Sampler *sa) const {
+        bool is(uint64_t c, const Scene *sc, const Sampler *sa) const {
             return cache == c && scene == sc && sampler == sa;
-        }
-
-        void set(const LightCache *c, const Scene *sc, const Sampler *sa,
-                 const Lights &l) {
-            sa->inc_ref();
-            l.inc_ref();
-            if (sampler)
-                sampler->dec_ref();
-            if (lights)
-                lights->dec_ref();
-            *this = { c, sc, sa, &l };
         }
     };
 
+    /// A thread comes with a new sampler
+    Visit visit(const Scene *scene, const Sampler *sampler) const {
+        std::lock_guard<std::mutex> guard(m_mutex);
+        Visited &visited = m_visited[std::this_thread::get_id()];
+        visited          = { mitsuba::ref<Sampler>(const_cast<Sampler *>(sampler)),
+                             vouched_or_updated(scene)->lights };
+        return { m_serial, scene, sampler, visited.lights.get() };
+    }
+
+    /// Renderings have checked their lights when they began
+    EntryPtr vouched_or_updated(const Scene *scene) const {
+        for (const EntryPtr &entry : m_entries)
+            if (entry && entry->scene == scene && entry->renderings > 0)
+                return entry;
+        return update(scene);
+    }
+
     /// Make the lights of a scene current, and build or refit them if they are new or changed
-    Entry &update(const Scene *scene) const {
+    EntryPtr update(const Scene *scene) const {
         refuse_freezing();
         Fingerprint<Float> fingerprint = Lights::fingerprint(scene);
-        for (const auto &entry : m_entries)
+        for (const EntryPtr &entry : m_entries)
             if (entry && entry->scene == scene &&
                 (entry->fingerprint == fingerprint || refit(*entry, fingerprint)))
-                return select(entry.get());
+                return m_current = entry;
         fingerprint.hold();
-        return select(build(scene, std::move(fingerprint)));
+        return m_current = build(scene, std::move(fingerprint));
     }
 
     /// If emitters have only become brighter or darker, and nobody uses the lights
@@ -146,7 +169,7 @@ private:
         if (m_keep_binary || entry.renderings > 0 ||
             !fingerprint.same_places(entry.fingerprint))
             return false;
-        std::vector<uint32_t> changed = fingerprint.changed_emission(entry.fingerprint);
+        auto changed = fingerprint.changed_emission(entry.fingerprint);
         // Single ones are faster read where they are
         std::vector<uint32_t> none;
         DeviceScalars<Float> scalars(changed.size() < 100 ? none
@@ -162,27 +185,17 @@ private:
     }
 
     /// Takes the place of this scene's old lights, or of the scene that was built before last
-    Entry *build(const Scene *scene, Fingerprint<Float> &&fingerprint) const {
-        size_t slot = m_entries[0] && m_current.load() == m_entries[0].get() ? 1 : 0;
+    EntryPtr build(const Scene *scene, Fingerprint<Float> &&fingerprint) const {
+        size_t slot = m_entries[0] && m_current == m_entries[0] ? 1 : 0;
         for (size_t i = 0; i < 2; ++i)
             if (m_entries[i] && m_entries[i]->scene == scene)
                 slot = i;
         DeviceScalars<Float> scalars(fingerprint.variables());
         mitsuba::ref<Lights> lights = new Lights(scene, m_keep_binary);
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
-        m_current = nullptr;
-        // Another thread may still be rendering with what is replaced
-        if (m_renderings == 0)
-            m_retired.clear();
-        if (m_entries[slot])
-            m_retired.push_back(std::move(m_entries[slot]));
-        m_entries[slot].reset(new Entry{ scene, std::move(fingerprint), lights });
-        return m_entries[slot].get();
-    }
-
-    Entry &select(Entry *entry) const {
-        m_current.store(entry, std::memory_order_release);
-        return *entry;
+        m_entries[slot] =
+            std::make_shared<Entry>(scene, std::move(fingerprint), std::move(lights));
+        return m_entries[slot];
     }
 
     static void refuse_freezing() {
@@ -206,13 +219,24 @@ private:
         return oss.str();
     }
 
+    /// No two caches have the same number, even if one lies where the other lay
+    static uint64_t next_serial() {
+        static std::atomic<uint64_t> count{ 0 };
+        return ++count;
+    }
+
+    /// What a thread uses
+    struct Visited {
+        mitsuba::ref<Sampler> sampler;
+        mitsuba::ref<Lights> lights;
+    };
+
     bool m_keep_binary;
+    const uint64_t m_serial = next_serial();
+    /// For all of the following
     mutable std::mutex m_mutex;
-    mutable std::unique_ptr<Entry> m_entries[2];
-    mutable std::vector<std::unique_ptr<Entry>> m_retired;
-    mutable std::atomic<Entry *> m_current{ nullptr };
-    /// Of all scenes
-    mutable uint32_t m_renderings = 0;
+    mutable EntryPtr m_entries[2], m_current;
+    mutable std::unordered_map<std::thread::id, Visited> m_visited;
     Statistics m_statistics;
 
     static constexpr const char *ClassName = "LightCache"; // for log messages

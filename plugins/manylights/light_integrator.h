@@ -7,12 +7,15 @@
 
 #include "light_cache.h"
 #include "parameters.h"
-#include <condition_variable>
+#include "passes.h"
+#include <drjit/morton.h>
 #include <drjit/packet.h>
+#include <mitsuba/core/progress.h>
 #include <mitsuba/render/film.h>
 #include <mitsuba/render/imageblock.h>
 #include <mitsuba/render/integrator.h>
 #include <mitsuba/render/sensor.h>
+#include <mitsuba/render/spiral.h>
 
 namespace manylights {
 
@@ -20,11 +23,12 @@ template <typename Float, typename Spectrum,
           template <typename, typename> typename BaseIntegrator>
 class LightIntegrator : public BaseIntegrator<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(BaseIntegrator, m_samples_per_pass, m_stop, m_render_timer,
-                   should_stop, render_sample)
+    MI_IMPORT_BASE(BaseIntegrator, m_block_size, m_samples_per_pass, m_stop,
+                   m_render_timer, should_stop, render_sample)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Film, ImageBlock)
     using Cache  = LightCache<Float, Spectrum>;
     using Lights = typename Cache::Lights;
+    using Pass   = manylights::Pass<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
         : Base(props), m_params(params), m_cache(params.splits_nodes()) {}
@@ -36,9 +40,8 @@ public:
         auto lock = lock_learning();
         typename Cache::Rendering guard(m_cache, scene);
         Learning learning(*this, scene, sensor, spp, guard.lights());
-        if constexpr (dr::is_jit_v<Float>)
-            if (m_learning == &learning)
-                return render_passes(scene, sensor, seed, develop, evaluate);
+        if (learning.wanted())
+            return render_passes(learning, scene, sensor, seed, develop, evaluate);
         return Base::render(scene, sensor, seed, spp, develop, evaluate);
     }
 
@@ -69,24 +72,6 @@ protected:
     SamplingParameters m_params;
     Cache m_cache;
 
-    /// Scalar variants: blocks come in the order of their passes, see \ref Learning
-    void render_block(const Scene *scene, const Sensor *sensor, Sampler *sampler,
-                      ImageBlock *block, Float *aovs, uint32_t sample_count, UInt32 seed,
-                      uint32_t block_id, uint32_t block_size) const override {
-        auto render = [&] {
-            Base::render_block(scene, sensor, sampler, block, aovs, sample_count, seed,
-                               block_id, block_size);
-        };
-        if (!m_learning)
-            return render();
-        typename Learning::Block current(*m_learning, block_id, block_size);
-        // By number, the blocks of later passes would have the seeds of other renderings
-        seed     = pass_seed(seed, current.pass);
-        block_id = current.number;
-        render();
-        current.put(block);
-    }
-
 private:
     /// One integrator learns from one rendering at a time: others that overlap wait for it
     std::unique_lock<std::recursive_mutex> lock_learning() {
@@ -94,11 +79,6 @@ private:
         if (m_params.learn_visibility != LearnVisibility::No)
             lock.lock();
         return lock;
-    }
-
-    /// The first pass has the seed of the rendering
-    static UInt32 pass_seed(const UInt32 &seed, uint32_t pass) {
-        return pass ? mitsuba::sample_tea_32(seed, UInt32(pass)).first : seed;
     }
 
     /// Gradients are computed from one recording, without passes
@@ -116,12 +96,12 @@ private:
     }
 
     /**
-     * The passes of a rendering. Visibility is learnt from the shadow rays of the first one, at
-     * most a sixteenth of the samples, and of a second one if the first promises much. JIT variants
-     * render all others in one pass, since each is recorded anew, which takes 3 to 17 ms;
-     * scalar ones in passes of the same size. Relative variance times time of a second
-     * training pass and of none, in llvm_ad_rgb with 64 samples for each of 256x144 pixels: .91
-     * and .98 in a house of 108 rooms with 10,000 and 1,000 lights, 1.04 to 1.12 where less is
+     * What is learnt while rendering. Visibility is learnt from the shadow rays of a first pass, at
+     * most a sixteenth of the samples, and of a second one if the first promises much. All others
+     * are rendered in one pass, whose pattern of samples is then as whole as it can be; in JIT
+     * variants each is recorded anew, which takes 3 to 17 ms. Relative variance times time of a
+     * second training pass and of none, in llvm_ad_rgb with 64 samples for each of 256x144 pixels:
+     * .91 and .98 in a house of 108 rooms with 10,000 and 1,000 lights, 1.04 to 1.12 where less is
      * hidden. More teach little: trained for 2, 4, 8 and all of 16 passes of the same size, that
      * house with 1,000 lights had .194, .189, .187 and .187 of relative variance at 603, 628, 664
      * and 742 ns a sample.
@@ -130,72 +110,42 @@ private:
     public:
         Learning(LightIntegrator &integrator, const Scene *scene, Sensor *sensor,
                  uint32_t spp, Lights &lights)
-            : m_integrator(integrator), m_lights(lights), m_film(sensor->film()),
-              m_size(film_size(m_film)) {
+            : m_integrator(integrator), m_lights(lights) {
             const SamplingParameters &params = integrator.m_params;
             if (params.learn_visibility == LearnVisibility::No || integrator.m_learning ||
                 integrator.m_differentiating ||
                 integrator.m_samples_per_pass != kOnePass ||
-                params.considers_all(lights.tree().light_count))
+                params.considers_all(lights.tree().light_count) ||
+                has_entry_for_each_sample(sensor))
                 return;
             Sampler *sampler = sensor->sampler();
             if (spp)
                 sampler->set_sample_count(spp);
-            spp          = sampler->sample_count();
-            double total = (double) dr::prod(m_size) * spp;
-            m_training   = training_samples(spp, dr::prod(m_size));
+            spp             = sampler->sample_count();
+            uint32_t pixels = dr::prod(film_size(sensor->film()));
+            double total    = (double) pixels * spp;
+            m_training      = training_samples(spp, pixels);
             if (spp < kLeastSamples || total < kLeastTotal || total > kMostTotal)
                 return;
             lights.start_learning(scene, cell_size(scene, sensor), total, keeps());
-            m_passes                      = spp / m_training;
-            integrator.m_samples_per_pass = m_training;
-            integrator.m_learning         = this;
+            integrator.m_learning = m_wanted = true;
         }
         ~Learning() {
-            if (m_integrator.m_learning != this)
+            if (!m_wanted)
                 return;
-            m_integrator.m_learning         = nullptr;
-            m_integrator.m_samples_per_pass = kOnePass;
+            m_integrator.m_learning = false;
             m_lights.stop_learning(keeps());
         }
+        Learning(const Learning &) = delete;
+
+        bool wanted() const { return m_wanted; }
 
         /// Returns the samples per pixel of a pass, of `left` that have not been rendered
         uint32_t start_pass(uint32_t pass, uint32_t left) {
             if (pass > 0 && m_trains)
                 m_trains = m_lights.learn(/* go_on = */ pass < kTraining);
-            m_started = pass + 1;
             return m_trains ? std::min(m_training, left) : left;
         }
-
-        /// A block waits for those of the pass before, and starts its pass if it is the first.
-        /// All of these have been handed out by then, so they are done or being rendered.
-        struct Block {
-            Learning &learning;
-            /// Its pass, and its number therein
-            uint32_t pass, number;
-
-            Block(Learning &l, uint32_t id, uint32_t size) : learning(l) {
-                uint32_t blocks = dr::prod((l.m_size + (size - 1)) / size);
-                pass            = l.m_passes - 1 - id / blocks;
-                number          = id % blocks;
-                std::unique_lock<std::mutex> lock(l.m_mutex);
-                l.m_block_done.wait(lock,
-                                    [&] { return l.m_blocks_done >= pass * blocks; });
-                if (pass == l.m_started)
-                    l.start_pass(pass, l.m_training);
-            }
-            /// Mitsuba would put it into the film after the next pass may have begun: sums
-            /// would depend on which is first. All that is left to it is zeros.
-            void put(ImageBlock *block) {
-                learning.m_film->put_block(block);
-                block->clear();
-            }
-            ~Block() {
-                std::lock_guard<std::mutex> lock(learning.m_mutex);
-                ++learning.m_blocks_done;
-                learning.m_block_done.notify_all();
-            }
-        };
 
     private:
         static constexpr uint32_t kTraining = 2,
@@ -241,34 +191,53 @@ private:
             return result;
         }
 
+        /// Does a parameter of the sensor have one entry for each sample of a rendering? All
+        /// samples are then rendered at once.
+        static bool has_entry_for_each_sample(const Sensor *sensor) {
+            struct Visitor : mitsuba::TraversalCallback {
+                size_t entries = 1;
+                void put_value(std::string_view, void *value, uint32_t,
+                               const std::type_info &type) override {
+                    if (type == typeid(Float))
+                        entries = std::max(entries, dr::width(*(const Float *) value));
+                }
+                void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
+            } visitor;
+            if constexpr (dr::is_jit_v<Float>) {
+                visitor.entries = dr::width(sensor->world_transform().matrix);
+                const_cast<Sensor *>(sensor)->traverse(&visitor);
+            }
+            return visitor.entries > 1;
+        }
+
         LightIntegrator &m_integrator;
         Lights &m_lights;
-        Film *m_film;
-        mitsuba::Vector<uint32_t, 2> m_size;
-        /// Samples per pixel of a training pass, and how many of its size there are
-        uint32_t m_training, m_passes;
-        bool m_trains      = true;
-        uint32_t m_started = 0, m_blocks_done = 0;
-        std::mutex m_mutex;
-        std::condition_variable m_block_done;
+        bool m_wanted = false, m_trains = true;
+        /// Samples per pixel of a training pass
+        uint32_t m_training;
     };
 
-    /// JIT variants: Mitsuba's passes are all of one size, those of \ref Learning are not
-    TensorXf render_passes(Scene *scene, Sensor *sensor, UInt32 seed, bool develop,
-                           bool evaluate) {
+    /// Mitsuba's passes are all of one size, those of \ref Learning are not
+    TensorXf render_passes(Learning &learning, Scene *scene, Sensor *sensor,
+                           const UInt32 &seed, bool develop, bool evaluate) {
         m_stop = false;
         m_render_timer.reset();
-        Film *film   = sensor->film();
-        auto size    = film_size(film);
-        uint32_t spp = sensor->sampler()->sample_count();
+        Film *film       = sensor->film();
+        Sampler *sampler = sensor->sampler();
+        auto size        = film_size(film);
+        uint32_t spp     = sampler->sample_count();
         Log(mitsuba::Info, "Starting render job (%ux%u, %u samples, learning visibility)",
             size.x(), size.y(), spp);
 
-        std::unique_ptr<Float[]> aovs(new Float[film->prepare(aov_names())]);
-        uint32_t done = 0;
-        for (uint32_t pass = 0; done < spp && !should_stop(); ++pass) {
-            uint32_t samples = m_learning->start_pass(pass, spp - done);
-            render_pass(scene, sensor, aovs.get(), pass_seed(seed, pass), done, samples);
+        size_t channels = film->prepare(aov_names());
+        uint32_t done   = 0;
+        for (uint32_t number = 0; done < spp && !should_stop(); ++number) {
+            uint32_t samples = learning.start_pass(number, spp - done);
+            Pass pass(seed, number, done, samples, sampler);
+            if constexpr (dr::is_jit_v<Float>)
+                render_wavefront(scene, sensor, channels, pass);
+            else
+                render_blocks(scene, sensor, channels, pass, spp);
             done += samples;
         }
         TensorXf result;
@@ -278,80 +247,135 @@ private:
         } else {
             film->schedule_storage();
         }
-        if (!evaluate)
-            return result;
-        dr::eval();
-        dr::sync_thread();
+        if constexpr (dr::is_jit_v<Float>) {
+            if (!evaluate)
+                return result;
+            dr::eval();
+            dr::sync_thread();
+        }
         if (!m_stop)
             Log(mitsuba::Info, "Rendering finished. (took %s)",
                 mitsuba::util::time_string((float) m_render_timer.value(), true));
         return result;
     }
 
-    /// How samples lie in a wavefront: blocks of lanes hold whole pixels, and some lanes may be
-    /// left over
-    struct Wavefront {
-        /// Lanes of a block, pixels therein, and lanes of each pixel
-        uint32_t block, pixels, samples;
+    // ------------------------------------------------------------------------ Scalar variants
 
-        uint32_t size(uint32_t pixel_count) const {
-            return (pixel_count + pixels - 1) / pixels * block;
-        }
-    };
-
-    /**
-     * Of the independent sampler, any number of samples. No pixel is split between threads, or
-     * warps that are not full, whose sums would depend on which of them came first, unless more
-     * than an eighth of the lanes would be left over. Of stratified samplers, a number that
-     * divides the whole, or else all samples.
-     */
-    static Wavefront wavefront(bool stratified, uint32_t first, uint32_t samples,
-                               uint32_t spp) {
-        uint32_t block = dr::is_cuda_v<Float> ? 32 : jit_llvm_block_size();
-        block          = std::max(block, mitsuba::math::round_to_power_of_two(samples));
-        if (!stratified && block % samples <= block / 8)
-            return { block, block / samples, samples };
-        bool divides   = first % samples == 0 && spp % samples == 0;
-        uint32_t lanes = stratified && !divides ? spp : samples;
-        return { lanes, 1, lanes };
+    /// Side of the blocks that threads render: all of them get some
+    uint32_t block_side(const mitsuba::Vector<uint32_t, 2> &size) const {
+        uint32_t side = m_block_size > 0 ? m_block_size : MI_BLOCK_SIZE;
+        auto count    = [&] { return dr::prod((size + (side - 1)) / side); };
+        while (m_block_size == 0 && side > 1 && count() <= pool_size())
+            side /= 2;
+        return side;
     }
 
-    /// Render some of each pixel's samples, from number `first` on
-    void render_pass(Scene *scene, Sensor *sensor, Float *aovs, const UInt32 &seed,
-                     uint32_t first, uint32_t samples) {
+    void render_blocks(Scene *scene, Sensor *sensor, size_t channels, const Pass &pass,
+                       uint32_t spp) {
+        Film *film    = sensor->film();
+        auto size     = film_size(film);
+        uint32_t side = block_side(size);
+        mitsuba::Spiral spiral(size, film->crop_offset(), side);
+        std::mutex mutex;
+        mitsuba::ref<mitsuba::ProgressReporter> progress = progress_reporter();
+        uint32_t count = spiral.block_count(), done = 0,
+                 grain = std::max(count / (4 * ((uint32_t) pool_size() + 1)), 1u);
+        dr::parallel_for(
+            dr::blocked_range<uint32_t>(0, count, grain), [&](const auto &range) {
+                mitsuba::ref<Sampler> sampler  = sensor->sampler()->fork();
+                mitsuba::ref<ImageBlock> block = film->create_block(
+                    ScalarVector2u(side), /* normalize = */ false, /* border = */ true);
+                std::unique_ptr<Float[]> aovs(new Float[channels]);
+                for (uint32_t i = range.begin(); i != range.end() && !should_stop();
+                     ++i) {
+                    auto [offset, extent, id] = spiral.next_block();
+                    if (film->sample_border())
+                        offset -= film->rfilter()->border_size();
+                    block->set_size(extent);
+                    block->set_offset(offset);
+                    render_pixels(scene, sensor, sampler, block, aovs.get(), pass, spp,
+                                  side);
+                    film->put_block(block);
+                    std::lock_guard<std::mutex> lock(mutex);
+                    if (++done; progress)
+                        progress->update(((float) pass.first +
+                                          (float) pass.samples * done / (float) count) /
+                                         (float) spp);
+                }
+            });
+    }
+
+    static mitsuba::ref<mitsuba::ProgressReporter> progress_reporter() {
+        auto *logger = mitsuba::logger();
+        return logger && mitsuba::Info >= logger->log_level()
+                   ? new mitsuba::ProgressReporter("Rendering")
+                   : nullptr;
+    }
+
+    /// Seeds belong to pixels: they do not depend on the size of blocks
+    void render_pixels(const Scene *scene, const Sensor *sensor, Sampler *sampler,
+                       ImageBlock *block, Float *aovs, const Pass &pass, uint32_t spp,
+                       uint32_t side) const {
+        const Film *film = sensor->film();
+        auto size        = film_size(film);
+        block->clear();
+        for (uint32_t i = 0; i < side * side && !should_stop(); ++i) {
+            auto at = dr::morton_decode<mitsuba::Point<uint32_t, 2>>(i);
+            if (dr::any(at >= block->size()))
+                continue;
+            Point2i place = Point2i(at) + block->offset(),
+                    pixel = place - Point2i(film->crop_offset());
+            if (film->sample_border())
+                pixel += film->rfilter()->border_size();
+            sampler->seed(pass.seed * dr::prod(size) + pixel.y() * size.x() + pixel.x());
+            skip(sampler, pass);
+            for (uint32_t j = 0; j < pass.samples && !should_stop(); ++j) {
+                render_sample(scene, sensor, sampler, block, aovs, Vector2f(place),
+                              dr::rsqrt((ScalarFloat) spp), true);
+                sampler->advance();
+            }
+        }
+    }
+
+    // --------------------------------------------------------------------------- JIT variants
+
+    void render_wavefront(Scene *scene, Sensor *sensor, size_t channels,
+                          const Pass &pass) {
         Film *film       = sensor->film();
         Sampler *sampler = sensor->sampler();
         auto size        = film_size(film);
         uint32_t spp     = sampler->sample_count();
-        bool stratified  = sampler->class_name() != std::string("IndependentSampler");
-        auto lanes       = wavefront(stratified, first, samples, spp);
-        if (!stratified)
-            sampler->set_sample_count(lanes.samples);
-        sampler->set_samples_per_wavefront(lanes.samples);
-        sampler->seed(seed, lanes.size(dr::prod(size)));
-        // Those before have been rendered: skipped if the wavefront lacks them, else masked
-        for (uint32_t i = 0; stratified && lanes.samples < spp && i < first; i += samples)
-            sampler->advance();
+        auto lanes       = wavefront(pass, spp);
 
         // Passes differ in these numbers: opaque, so that they have one kernel
         UInt32 index    = dr::arange<UInt32>(lanes.size(dr::prod(size)));
         auto [block, i] = divide(index, lanes.block);
         auto [local, j] = divide(i, lanes.samples);
         UInt32 pixel    = dr::fmadd(block, dr::opaque<UInt32>(lanes.pixels), local);
+        uint32_t masked = pass.sampler.independent ? 0 : pass.first;
         Mask active     = local < dr::opaque<UInt32>(lanes.pixels) &&
-                          pixel < dr::prod(size) &&
-                          j >= dr::opaque<UInt32>(lanes.samples > samples ? first : 0);
+                          pixel < dr::prod(size) && j >= dr::opaque<UInt32>(masked);
+
+        SampleCount<Float, Spectrum> guard(sampler);
+        if (pass.sampler.independent)
+            sampler->set_sample_count(lanes.samples);
+        sampler->set_samples_per_wavefront(lanes.samples);
+        // A pattern depends on the number of a pixel's first lane: to be that of all samples
+        UInt32 seed = pass.seed;
+        if (pass.sampler.pattern && lanes.samples < spp)
+            seed += pixel * (spp - lanes.samples);
+        sampler->seed(seed, lanes.size(dr::prod(size)));
 
         // One for each pass: sums do not depend on which thread got which part
         mitsuba::ref<ImageBlock> image = film->create_block();
         image->set_offset(film->crop_offset());
-        render_sample(scene, sensor, sampler, image, aovs, position(film, size, pixel),
-                      dr::rsqrt((ScalarFloat) spp), active);
-        if (first + samples < spp) // the last pass waits as any other rendering does
+        std::unique_ptr<Float[]> aovs(new Float[channels]);
+        render_sample(scene, sensor, sampler, image, aovs.get(),
+                      position(film, size, pixel), dr::rsqrt((ScalarFloat) spp), active);
+        if (pass.first + pass.samples <
+            spp) // the last pass waits as any other rendering does
             dr::eval(image->tensor());
         film->put_block(image);
-        sampler->set_sample_count(spp);
-        sampler->set_samples_per_wavefront(spp);
     }
 
     /// Quotient and remainder: exact, and faster than a division of integers
@@ -374,8 +398,7 @@ private:
     static constexpr const char *ClassName = "LightIntegrator"; // for log messages
 
     std::recursive_mutex m_mutex;
-    Learning *m_learning   = nullptr;
-    bool m_differentiating = false;
+    bool m_learning = false, m_differentiating = false;
 };
 
 } // namespace manylights

@@ -24,6 +24,7 @@
 #include <mitsuba/core/logger.h>
 #include <mitsuba/core/qmc.h>
 #include <mitsuba/render/scene.h>
+#include <optional>
 #include <unordered_map>
 
 namespace manylights {
@@ -82,6 +83,17 @@ public:
             reader.take_lobes_for_cosines();
         reader.estimate_unknown_powers();
         reader.warn_of_invalid_lights();
+        return std::move(reader.m_table);
+    }
+
+    /// Read one emitter alone; none if its power depends on the others
+    static std::optional<Table> read_one(const Scene *scene, uint32_t emitter) {
+        LightTableReader reader;
+        reader.m_scene = scene;
+        reader.m_table.proportional.resize(scene->emitters().size(), false);
+        reader.add(scene->emitters()[emitter].get(), emitter);
+        if (reader.m_unknown_powers)
+            return {};
         return std::move(reader.m_table);
     }
 

@@ -11,6 +11,7 @@
 
 #include "emission_reader.h"
 #include "loop.h"
+#include "scene_shapes.h"
 #include <drjit/random.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/medium.h>
@@ -85,14 +86,14 @@ public:
     MI_IMPORT_TYPES(Scene, Sampler, BSDFPtr, Medium, MediumPtr)
     using Rng = dr::PCG32<dr::uint32_array_t<dr::detached_t<Float>>>;
 
-    /// The media of the scene's shapes and sensors. Shapes within groups cannot be asked.
+    /// The media of the scene's shapes, within groups, too, and of its sensors
     static MediaKinds find(const Scene *scene) {
         MediaKinds kinds;
         using Reader = MediumReader<Float, Spectrum>;
-        for (const auto &shape : scene->shapes()) {
+        for_each_shape(scene, [&](const auto *shape) {
             Reader::add(kinds, shape->interior_medium());
             Reader::add(kinds, shape->exterior_medium());
-        }
+        });
         for (const auto &sensor : scene->sensors())
             Reader::add(kinds, sensor->medium());
         return kinds;

@@ -31,7 +31,7 @@ public:
         return dr::select(g > 0.f && dr::isfinite(g), dr::minimum(g, 1e25f), 0.f);
     }
 
-    /// Lobes are measured only if the scene has any: each costs two evaluations of the BSDF
+    /// Lobes are measured only where there may be one: each costs two evaluations of the BSDF
     static void read(Receiver<FloatD> &at, const SurfaceInteraction3f &si,
                      const BSDFPtr &bsdf, Mask active) {
         auto flags     = bsdf->flags(active);
@@ -42,7 +42,8 @@ public:
         at.wi          = plain(si.to_world(si.wi));
         at.transmits   = plain(transmits);
         if (at.lobes != Lobes::None)
-            measure_lobe(si, bsdf, at, active);
+            measure_lobe(si, bsdf, at,
+                         active && has_flag(flags, mitsuba::BSDFFlags::Glossy));
         if (at.lobes == Lobes::Transmitted)
             measure_transmission(
                 si, bsdf, at,
@@ -86,13 +87,17 @@ private:
     }
 
     /**
-     * The glossy lobe, for any BSDF: its value and density in the mirror direction, and its
+     * The glossy lobe, for any BSDF that may have one: its value and density in the mirror direction, and its
      * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.
      * Only h and H see this, so it does not have to be right.
      */
     MI_NOINLINE static void measure_lobe(const SurfaceInteraction3f &si,
                                          const BSDFPtr &bsdf, Receiver<FloatD> &at,
                                          Mask active) {
+        at.diffuse = kTypicalBsdf;
+        at.alpha2  = 1.f;
+        if (dr::none_or<false>(active))
+            return;
         dr::suspend_grad<Float> detached;
         mitsuba::BSDFContext ctx;
         Float cos_i = Frame3f::cos_theta(si.wi);
@@ -109,11 +114,13 @@ private:
         FloatD alpha2 =
             dr::rcp(4.f * dr::Pi<FloatD> * cosine *
                     dr::maximum(plain(density) - cosine * dr::InvPi<FloatD>, .05f));
-        at.alpha2 = dr::clip(alpha2, 1e-5f, 1.f);
-        at.specular =
+        MaskD glossy = plain(active);
+        at.alpha2    = dr::select(glossy, dr::clip(alpha2, 1e-5f, 1.f), 1.f);
+        FloatD specular =
             dr::maximum(on - off * cosine, 0.f) * at.alpha2 / masking(cosine, at.alpha2);
+        at.specular = dr::select(glossy, specular, 0.f);
         // The share that the lobe never takes away
-        at.diffuse = off + kLobeFloor * on / cosine + 1e-6f;
+        dr::masked(at.diffuse, glossy) = off + kLobeFloor * on / cosine + 1e-6f;
     }
 
     /**

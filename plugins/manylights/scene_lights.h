@@ -134,29 +134,36 @@ public:
         m_statistics.build_ms = stopwatch.milliseconds();
     }
 
+    using Change = typename Fingerprint<Float>::Change;
+
     /**
      * Follow a change of what some emitters emit, without a new tree: colours, fluxes and
      * moments. False if that is not possible; the lights are then of no use any more.
      *
-     * Lights with power stay where they are; those that had none are missing. Binary nodes
-     * are not kept up to date.
+     * Lights with power stay where they are; those that had none are missing. What has got a
+     * gradient leaves the table, but not its place; without it, there is a new tree. Binary
+     * nodes are not kept up to date.
      */
-    bool refit(const Scene *scene, const std::vector<uint32_t> &changed) {
+    bool refit(const Scene *scene, const std::vector<Change> &changed) {
         Stopwatch stopwatch;
         std::vector<Emission> emission;
         std::vector<uint32_t> index(m_proportional.size(), kNone); // into `emission`
-        for (uint32_t i : changed) {
-            const Emitter *emitter = scene->emitters()[i].get();
-            Emission e             = EmissionReader<Float, Spectrum>::read(emitter);
-            if (!m_proportional[i] || !e.tabulated || !(e.brightness > 0) ||
-                !std::isfinite(e.brightness))
-                return false;
-            if (has_flag(emitter->flags(), mitsuba::EmitterFlags::Infinite))
+        std::vector<uint32_t> differentiated;
+        for (const Change &change : changed) {
+            uint32_t i = change.emitter;
+            if (change.differentiated) {
+                differentiated.push_back(i);
                 continue;
+            }
+            Emission e =
+                EmissionReader<Float, Spectrum>::read(scene->emitters()[i].get());
+            if (change.was_differentiated || !m_proportional[i] || !e.tabulated ||
+                !(e.brightness > 0) || !std::isfinite(e.brightness))
+                return false;
             index[i] = (uint32_t) emission.size();
             emission.push_back(e);
         }
-        if (!emission.empty() && !refit(emission, index))
+        if (!changed.empty() && !refit(scene, emission, index, differentiated))
             return false;
         m_statistics.refit_ms = stopwatch.milliseconds();
         return true;
@@ -167,8 +174,13 @@ public:
         dr::mask_t<Float> active(true);
         for (const auto &emitter : scene->emitters()) {
             const Shape *shape = emitter->shape();
-            result.add_emitter(emitter.get());
-            uint32_t flags = emitter->flags(active);
+            uint32_t flags     = emitter->flags(active);
+            bool infinite      = has_flag(flags, mitsuba::EmitterFlags::Infinite);
+            // Of those at infinity only pointers are kept
+            if (infinite && !shape)
+                result.add_untouched(emitter.get());
+            else
+                result.add_emitter(emitter.get());
             result.mix(flags);
             if (shape) {
                 result.add(shape);
@@ -176,7 +188,7 @@ public:
             }
             // Kernels know them by number: another object may have got the address
             if constexpr (dr::is_jit_v<Float>)
-                if (shape || has_flag(flags, mitsuba::EmitterFlags::Infinite))
+                if (shape || infinite)
                     result.mix(jit_registry_id(shape ? (const void *) shape
                                                      : (const void *) emitter.get()));
         }
@@ -196,15 +208,16 @@ public:
      */
     void start_learning(const Scene *scene, const CellSize &size, double samples,
                         bool keep) {
+        double wanted    = std::min(512. * m_statistics.nodes, samples);
+        uint32_t records = 1u << 12;
+        while (records < kMostRecords && records < wanted)
+            records *= 2;
         Fingerprint<Float> shapes(0);
         if (keep)
-            for (const auto &shape : scene->shapes())
-                shapes.add_emitter(shape.get());
-        if (!keep || !m_visibility || !shapes.same_places(m_learnt_shapes)) {
-            double wanted    = std::min(512. * m_statistics.nodes, samples);
-            uint32_t records = 1u << 12;
-            while (records < kMostRecords && records < wanted)
-                records *= 2;
+            for_each_shape(scene, [&](const Shape *shape) { shapes.add_emitter(shape); });
+        if (keep && m_visibility && shapes.same_places(m_learnt_shapes)) {
+            m_visibility->prepare(records, size);
+        } else {
             m_visibility    = std::make_unique<VisibilityTable<FloatD>>(records, size);
             m_learnt_shapes = std::move(shapes);
             m_learnt_shapes.hold();
@@ -292,15 +305,13 @@ private:
 
     static Lobes find_lobes(const Scene *scene) {
         Lobes result = Lobes::None;
-        for (const auto &shape : scene->shapes()) {
-            if (!shape->bsdf())
-                continue;
-            uint32_t flags = shape->bsdf()->flags();
+        for_each_shape(scene, [&](const Shape *shape) {
+            uint32_t flags = shape->bsdf() ? shape->bsdf()->flags() : 0;
             if (has_flag(flags, mitsuba::BSDFFlags::GlossyTransmission))
-                return Lobes::Transmitted;
-            if (has_flag(flags, mitsuba::BSDFFlags::Glossy))
-                result = Lobes::Reflected;
-        }
+                result = Lobes::Transmitted;
+            else if (has_flag(flags, mitsuba::BSDFFlags::Glossy))
+                result = std::max(result, Lobes::Reflected);
+        });
         return result;
     }
 
@@ -338,14 +349,15 @@ private:
         HostVector<LightRow>().swap(table.rows);
     }
 
-    bool refit(const std::vector<Emission> &emission,
-               const std::vector<uint32_t> &index) {
+    bool refit(const Scene *scene, const std::vector<Emission> &emission,
+               const std::vector<uint32_t> &index,
+               const std::vector<uint32_t> &differentiated) {
         HostStorage<Storage> row_storage, node_storage;
         HostVector<float> fluxes(m_tree.light_count);
         LightRow *rows  = (LightRow *) row_storage.open(m_tree.rows);
         WideNode *nodes = (WideNode *) node_storage.open(m_tree.nodes);
         bool beams      = m_tree.directions == Directions::Beams;
-        std::atomic<bool> valid{ true };
+        std::atomic<bool> valid{ replace_rows(scene, differentiated, rows) };
         for_chunks(m_tree.light_count, [&](size_t, size_t begin, size_t end) {
             for (size_t i = begin; i < end; ++i) {
                 LightRow &row = rows[i];
@@ -365,6 +377,56 @@ private:
         m_tree.rows  = row_storage.close();
         m_tree.nodes = node_storage.close();
         return true;
+    }
+
+    /// Read all lights of some emitters again, each to the place that it has. False if others
+    /// have power than before.
+    bool replace_rows(const Scene *scene, const std::vector<uint32_t> &emitters,
+                      LightRow *rows) {
+        if (emitters.empty())
+            return true;
+        std::vector<std::vector<uint32_t>> places = places_of(emitters, rows);
+        for (size_t i = 0; i < emitters.size(); ++i) {
+            auto table = LightTableReader<Float, Spectrum>::read_one(scene, emitters[i]);
+            if (!table || table->rows.size() != places[i].size())
+                return false;
+            for (size_t k = 0; k < places[i].size(); ++k) {
+                LightRow &row = rows[places[i][k]], read = table->rows[k];
+                // Other triangles may have power than before
+                bool triangle =
+                    (read.tag & kTagKindMask) == (uint32_t) LightKind::Triangle;
+                if (triangle &&
+                    !std::equal(row.geometry, row.geometry + 9, read.geometry))
+                    return false;
+                read.link = row.link;
+                row       = read;
+            }
+            m_tree.kinds.bits |= table->kinds.bits;
+            m_needs_emitter_eval |= table->needs_emitter_eval;
+        }
+        return true;
+    }
+
+    /// Where the lights of emitters are, in the order in which they are read
+    std::vector<std::vector<uint32_t>> places_of(const std::vector<uint32_t> &emitters,
+                                                 const LightRow *rows) const {
+        std::vector<uint32_t> index(m_proportional.size(), kNone);
+        for (size_t i = 0; i < emitters.size(); ++i)
+            index[emitters[i]] = (uint32_t) i;
+        std::vector<std::vector<uint32_t>> places(emitters.size());
+        for (uint32_t i = 0; i < m_tree.light_count; ++i)
+            if (uint32_t e = index[rows[i].tag >> kTagEmitterShift]; e != kNone)
+                places[e].push_back(i);
+        // Of a mesh, in the order of its primitives
+        HostView lights(m_light_of_primitive);
+        std::vector<uint32_t> order(m_tree.light_count, kNone);
+        for (uint32_t i = 0; i < lights.size(); ++i)
+            if (lights[i] < kOnlyHit)
+                order[lights[i]] = i;
+        for (auto &list : places)
+            std::sort(list.begin(), list.end(),
+                      [&](uint32_t a, uint32_t b) { return order[a] < order[b]; });
+        return places;
     }
 
     static void set_emission(LightRow &row, const Emission &e) {

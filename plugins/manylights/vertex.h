@@ -39,8 +39,10 @@ template <typename Float> struct Counts {
         candidates += dr::select(on, FloatD(found), 0.f);
         node_visits += dr::select(on, FloatD(visits), 0.f);
     }
-    /// Film channels, see \ref count_channels
+    /// Film channels, see \ref count_channels; null: the caller has none
     void write(Float *aovs, const SamplingParameters &params) const {
+        if (!aovs)
+            return;
         aovs[0] = Float(candidates);
         aovs[1] = Float(node_visits);
         if (params.method == Method::ResampledTree)

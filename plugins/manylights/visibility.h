@@ -145,6 +145,38 @@ public:
             m_counts[index].fetch_add(1, std::memory_order_relaxed);
     }
 
+    /**
+     * Go on with another rendering: with at least as many records, of which each starts with
+     * what those knew that shared it, and cells as large as its camera deserves. Where these
+     * are as large as before they are still known.
+     */
+    void prepare(uint32_t records, const CellSize &size) {
+        m_camera = { size.camera[0], size.camera[1], size.camera[2] };
+        m_scene  = size.scene;
+        dr::make_opaque(m_camera, m_scene);
+        if (records <= m_records)
+            return;
+        if constexpr (dr::is_jit_v<Float>) {
+            auto repeat = [&](const UInt32 &array, uint32_t width) {
+                UInt32 index = dr::arange<UInt32>(records * width);
+                return dr::gather<UInt32>(array, index & (m_records * width - 1u));
+            };
+            m_factors = repeat(m_factors, 1);
+            m_counts  = repeat(m_counts, kCounts);
+            dr::make_opaque(m_factors, m_counts);
+        } else {
+            Storage factors = dr::empty<Storage>(records);
+            Counts counts(records * kCounts);
+            for (size_t i = 0; i < records; ++i)
+                factors.data()[i] = m_factors.data()[i & (m_records - 1)];
+            for (size_t i = 0; i < counts.size(); ++i)
+                counts[i] = m_counts[i & (m_records * kCounts - 1)].load();
+            m_factors = std::move(factors);
+            m_counts  = std::move(counts);
+        }
+        m_records = records;
+    }
+
     /// Is \ref count to be called?
     const Mask &counting() const { return m_counting; }
     void set_counting(bool on) { m_counting = dr::opaque<Mask>(on); }
