@@ -158,3 +158,38 @@ def test_small_far_sphere(variant, ratio, bsdf_samples):
     scene = patch(lamp=lamp)
     bias = 0.03 if ratio > 0.1 else 1e-3
     assert_irradiance(scene, np.pi * ratio**2, integrator, bias=bias, label=f"r/d = {ratio}")
+
+
+LINE = {
+    "type": "irregular",
+    "wavelengths": "360,541,543,547,549,830",
+    "values": "0,0,90,90,0,0",
+}
+"""One spectral line of some nanometres."""
+
+
+@pytest.mark.parametrize("variant", ["scalar_spectral", "llvm_ad_spectral"], indirect=True)
+@pytest.mark.parametrize("kind", ["mesh", "sphere", "point"])
+def test_spectral_lines_are_sampled(variant, kind):
+    """Light sampling alone finds as much light as Mitsuba's, and weighs all lights alike."""
+    lamps = {}
+    for index in range(12):
+        position = [index % 4 - 1.5, index // 4 - 1.0, 2.0]
+        lamp = {"type": "point", "position": position, "intensity": LINE}
+        if kind != "point":
+            place = transform().translate(position).rotate([1, 0, 0], 180).scale(0.3)
+            shape = "rectangle" if kind == "mesh" else "sphere"
+            lamp = {"type": shape, "to_world": place}
+            lamp["emitter"] = {"type": "area", "radiance": LINE}
+        lamps[f"lamp_{index}"] = lamp
+    scene = mi.load_dict(patch(**lamps))
+    images = []
+    for name in ("direct", "manylights_direct"):
+        integrator = {"type": name, "bsdf_samples": 0}
+        if name == "direct":
+            integrator["emitter_samples"] = 1
+        integrator = mi.load_dict(integrator)
+        images.append(tools.render_seeds(scene, integrator, 1024, range(SEEDS)))
+    tools.assert_same_mean(*images[::-1], bias=0.3, power_channels=[1], label=kind)
+    lights = mi.traverse(integrator)["lights_in_tree"]
+    assert lights == (24 if kind == "mesh" else 12)

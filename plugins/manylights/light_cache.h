@@ -28,7 +28,8 @@ public:
     using Scene   = mitsuba::Scene<Float, Spectrum>;
     using Sampler = mitsuba::Sampler<Float, Spectrum>;
 
-    explicit LightCache(bool keep_binary) : m_keep_binary(keep_binary) {}
+    LightCache(bool keep_binary, bool finds_by_rays)
+        : m_keep_binary(keep_binary), m_finds_by_rays(finds_by_rays) {}
 
 private:
     struct Entry {
@@ -170,6 +171,8 @@ private:
         DeviceScalars<Float> scalars(fingerprint.variables());
         mitsuba::ref<Lights> lights = new Lights(scene, m_keep_binary);
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
+        if (!m_finds_by_rays)
+            lights->warn_of_lights_for_rays();
         m_current = nullptr;
         // Another thread may still be rendering with what is replaced
         if (m_renderings == 0)
@@ -207,6 +210,8 @@ private:
     }
 
     bool m_keep_binary;
+    /// Do rays that leave surfaces find lights?
+    bool m_finds_by_rays;
     mutable std::mutex m_mutex;
     mutable std::unique_ptr<Entry> m_entries[2];
     mutable std::vector<std::unique_ptr<Entry>> m_retired;
