@@ -135,7 +135,10 @@ Emitters of all kinds are supported. Point and spot lights and area lights on me
 disks and cylinders are evaluated without virtual function calls, so that kernels do not grow
 with the number of lights; other emitters, and radiance that varies over a triangle, are
 evaluated by their own plugins once they were selected. Shapes on which Mitsuba cannot choose a
-point (curves) are found by BSDF sampling alone.
+point (curves) are found by BSDF sampling alone: with :code:`bsdf_samples` 0 a warning names the
+first of them. As in Mitsuba's integrators, light sampling never chooses an emitter whose
+:code:`sampling_weight` is 0, so that it is dark if rays cannot hit it; other weights do not matter
+here. The unit of emission does not matter either.
 
 .. note:: This integrator does not handle participating media or indirect illumination. In JIT
    variants it refuses to be recorded by :code:`dr.freeze`.

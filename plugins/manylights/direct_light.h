@@ -24,6 +24,7 @@
 #include "scene_emission.h"
 #include "vertex.h"
 #include <array>
+#include <cfloat>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/integrator.h>
 #include <mitsuba/render/sampler.h>
@@ -231,7 +232,8 @@ public:
         }
         Mask missed = active && !hit.is_valid();
         if (const Emitter *environment = m_scene->environment();
-            environment && dr::any_or<true>(missed)) {
+            environment && environment->sampling_weight() > 0 &&
+            dr::any_or<true>(missed)) {
             DirectionSample3f ds(m_scene, hit, from);
             dr::masked(result, missed) =
                 infinite_probability() * environment->pdf_direction(from, ds, missed);
@@ -375,9 +377,9 @@ private:
     }
 
     /// For film channels: the light of a weighted target F f that should arrive, F f^2 = F v
-    static FloatD expected_light(const FloatD &target, const FloatD &visibility,
-                                 const MaskD &active) {
-        return dr::select(active, target * visibility, 0.f);
+    FloatD expected_light(const FloatD &target, const FloatD &visibility,
+                          const MaskD &active) const {
+        return dr::select(active, target * visibility * m_lights.tree().unit, 0.f);
     }
 
     /// Stage 2: deal the candidates to m reservoirs
@@ -403,7 +405,8 @@ private:
             state, [&](const State &s) { return on && s.cursor.has_next(); },
             [&](State &s) {
                 auto candidate = s.cursor.next(tree, at, s.rng);
-                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds) *
+                FloatD h = light_importance(at, tree.row(candidate.light), tree.kinds,
+                                            tree.scale) *
                            candidate.visibility;
                 s.reservoirs.add(candidate, h, m_slots, dealing, s.rng);
                 s.candidates += 1u;
@@ -489,7 +492,7 @@ private:
         FloatD tau(0.f);
         if (m_choose) {
             for (size_t i = 0; i < infinite_items(); ++i)
-                kept.target[m_slots + i] = Reader::target(infinite[i].unoccluded());
+                kept.target[m_slots + i] = target(infinite[i].unoccluded());
             tau = selection_threshold<FloatD>(kept.target, m_items, m_params.shadow_rays,
                                               FloatD(vertex.effort.shadow_rays));
         }
@@ -606,11 +609,11 @@ private:
             // Far from the smallest floats, which some threads round to zero
             constexpr float least = 1e-30f;
             MaskD traced          = plain(active) && chosen.item < m_slots &&
-                                    Reader::target(sample.unoccluded()) > least;
+                                    target(sample.unoccluded()) > least;
             UInt32D slot          = dr::minimum(chosen.item, m_slots - 1u);
             count_ray(m_lights.tree(), vertex.at.cell,
                       read_slot<UInt32D>(kept.light, slot, m_slots),
-                      Reader::target(result) > least, traced);
+                      target(result) > least, traced);
         }
         return result;
     }
@@ -668,6 +671,11 @@ private:
                active;
     }
 
+    /// What values are compared by: in units of the scene's brightest light
+    FloatD target(const Spectrum &value) const {
+        return Reader::target(value, m_lights.tree().scale);
+    }
+
     /// |F| of a light's point
     FloatD light_target(const Vertex &vertex, const UInt32D &light,
                         const FloatD &inclusion, const UInt32D &slot, Kept &kept,
@@ -677,14 +685,14 @@ private:
         if constexpr (!dr::is_jit_v<Float>)
             if (m_keeps_samples)
                 kept.sample[slot] = sample;
-        FloatD target = Reader::target(sample.unoccluded());
+        FloatD g = target(sample.unoccluded());
         if (vertex.at.media) {
             bool segment = vertex.at.extent == Extent::Segment;
             auto from    = segment ? plain(sample.from) : vertex.at.p;
             auto far     = attenuation(vertex.at, dr::norm(plain(sample.p) - from));
-            target = dr::select(target > 0.f, target * far, 0.f); // else p is undefined
+            g            = dr::select(g > 0.f, g * far, 0.f); // else p is undefined
         }
-        return target;
+        return g;
     }
 
     using Distances = typename Vertex::Distances;
@@ -785,8 +793,12 @@ private:
         if (others) {
             other &= active;
             if (target_only) {
-                Float guess = Float(light_importance(vertex.at, row, kinds)) *
-                              (vertex.at.lobes == Lobes::None ? kTypicalBsdf : 1.f);
+                float bsdf       = vertex.at.lobes == Lobes::None ? kTypicalBsdf : 1.f;
+                const auto &tree = m_lights.tree();
+                FloatD h         = light_importance(vertex.at, row, kinds, tree.scale);
+                // Not rounded to zero in units of the scene
+                Float guess(
+                    dr::select(h > 0.f, dr::maximum(h * tree.unit * bsdf, FLT_MIN), 0.f));
                 dr::masked(result, other) = Sample::make(
                     Spectrum(1.f),
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess)),

@@ -78,13 +78,14 @@ LightPoint<Float> sample_sphere(const Row<Float> &row, const mitsuba::Point<Floa
     Float radius       = row[3];
     SphereCone<Float> cone(to_center, radius);
 
-    // Angle at the centre of the point where a direction of the cone enters
+    // Angle at the centre of the point where a direction of the cone enters; where it leaves,
+    // on the far side, if the sphere emits inwards
     Float cos_theta   = 1.f - u.x() * cone.one_minus_cos,
           sin2        = u.x() * cone.one_minus_cos * (1.f + cos_theta);
     Float inv_sin_max = dr::rsqrt(cone.sin2);
-    Float cos_alpha =
-        sin2 * inv_sin_max + cos_theta * dr::safe_sqrt(1.f - sin2 / cone.sin2);
-    Float sin_alpha     = dr::safe_sqrt(1.f - dr::square(cos_alpha));
+    Float cos_alpha = dr::fmadd(row[4], cos_theta * dr::safe_sqrt(1.f - sin2 / cone.sin2),
+                                sin2 * inv_sin_max);
+    Float sin_alpha = dr::safe_sqrt(1.f - dr::square(cos_alpha));
     auto [sin_p, cos_p] = dr::sincos(dr::TwoPi<Float> * u.y());
     Vector3f d = Frame3f(-dr::normalize(to_center))
                      .to_world(Vector3f(cos_p * sin_alpha, sin_p * sin_alpha, cos_alpha));

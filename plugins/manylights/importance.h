@@ -104,11 +104,9 @@ Value masking(const Value &c, const Float &alpha2) {
 
 /// c + sqrt(c^2 + s^2): 2 max(c, 0), smoothed by a variance s^2
 template <typename Value> Value twice_positive(const Value &c, const Value &variance) {
-    Value result = c + dr::sqrt(dr::fmadd(c, c, variance));
-    // CUDA's root is approximate: below the horizon it may be less than -c
-    if constexpr (dr::is_cuda_v<Value>)
-        result = dr::maximum(result, 0.f);
-    return result;
+    // Below the horizon the root may be less than -c: CUDA's is approximate, and the square of
+    // a tiny c is rounded to zero
+    return dr::maximum(c + dr::sqrt(dr::fmadd(c, c, variance)), 0.f);
 }
 
 /// What an observer of a lobe has to know of a light or a cluster at w, of variance s^2
@@ -451,10 +449,11 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
  *
  * For a flat emitter of area A the distance^2 is d^2 + .08 A, half of its variance; a point
  * on the surface then has no pole. It is zero only behind a one-sided flat emitter and
- * outside of a spot's cone.
+ * outside of a spot's cone. `scale` brings it into the units of targets.
  */
 template <typename Float>
-Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds) {
+Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds,
+                       const Float &scale) {
     auto look = [&](const Receiver<Float> &from) {
         return by_kind<Appearance<Float>>(
             row, kinds, [&](LightKind kind) { return appearance(from, row, kind); });
@@ -482,7 +481,7 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
     }
     if (at.media)
         reflected *= attenuation(at, Float(d2 * inv_d));
-    return row[kBrightness] * a.intensity * reflected * inv_d * inv_d;
+    return row[kBrightness] * scale * a.intensity * reflected * inv_d * inv_d;
 }
 
 } // namespace manylights

@@ -32,7 +32,8 @@ public:
     using Scene   = mitsuba::Scene<Float, Spectrum>;
     using Sampler = mitsuba::Sampler<Float, Spectrum>;
 
-    explicit LightCache(bool keep_binary) : m_keep_binary(keep_binary) {}
+    LightCache(bool keep_binary, bool finds_by_rays)
+        : m_keep_binary(keep_binary), m_finds_by_rays(finds_by_rays) {}
 
 private:
     /// The lights of a scene as it was; those who use them keep it
@@ -193,6 +194,8 @@ private:
         DeviceScalars<Float> scalars(fingerprint.variables());
         mitsuba::ref<Lights> lights = new Lights(scene, m_keep_binary);
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
+        if (!m_finds_by_rays)
+            lights->warn_of_lights_for_rays();
         m_entries[slot] =
             std::make_shared<Entry>(scene, std::move(fingerprint), std::move(lights));
         return m_entries[slot];
@@ -232,6 +235,8 @@ private:
     };
 
     bool m_keep_binary;
+    /// Do rays that leave surfaces find lights?
+    bool m_finds_by_rays;
     const uint64_t m_serial = next_serial();
     /// For all of the following
     mutable std::mutex m_mutex;

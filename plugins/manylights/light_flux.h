@@ -2,7 +2,8 @@
 
 /**
  * Emitted power of a light, and its weight in the tree, from its row of the table: the
- * same when the table is read and when emitters have only become brighter or darker.
+ * same when the table is read and when emitters have only become brighter or darker. Doubles,
+ * which hold the products of all floats.
  *
  * Plain C++, no Dr.Jit and no Mitsuba types.
  */
@@ -10,6 +11,7 @@
 #include "light.h"
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace manylights {
 
@@ -49,21 +51,34 @@ inline float spot_power(float cutoff, float inverse_transition) {
     return 2 * kPi * (sin_beam * sin_beam + sin_cutoff * sin_cutoff);
 }
 
-inline float light_power(const LightRow &row) {
-    LightKind kind = (LightKind) (row.tag & kTagKindMask);
+inline double light_power(const LightRow &row) {
+    LightKind kind    = (LightKind) (row.tag & kTagKindMask);
+    double brightness = row.brightness;
     if (kind == LightKind::Point || kind == LightKind::Other)
-        return 4 * kPi * row.brightness;
+        return 4 * kPi * brightness;
     if (kind == LightKind::Spot)
-        return spot_power(row.geometry[6], row.geometry[7]) * row.brightness;
-    return light_area(row, kind) * kPi * row.brightness;
+        return spot_power(row.geometry[6], row.geometry[7]) * brightness;
+    return light_area(row, kind) * kPi * brightness;
 }
 
-/// Weight in the tree (see LightBounds); `beams`: are there narrow spots in the scene?
-inline float light_flux(const LightRow &row, bool beams) {
-    float power = light_power(row);
+/// Weight in the tree (see LightBounds); `beams`: do narrow spots matter in the scene?
+inline double light_flux(const LightRow &row, bool beams) {
+    double power = light_power(row);
     if (!beams && (row.tag & kTagKindMask) == (uint32_t) LightKind::Spot)
         return std::sqrt(power * 4 * kPi * row.brightness);
     return power;
+}
+
+/// The power of two that brings the largest flux of a scene to [1, 2): weights relative to it
+/// are the same in any unit, and exact
+inline float flux_scale(double largest) {
+    bool usable = largest > 0 && std::isfinite(largest);
+    return std::ldexp(1.f, usable ? -std::clamp(std::ilogb(largest), -126, 126) : 0);
+}
+
+/// A flux in these units. The tree needs it to be positive
+inline float scaled_flux(double flux, float scale) {
+    return std::max((float) (flux * scale), std::numeric_limits<float>::min());
 }
 
 } // namespace manylights

@@ -31,7 +31,8 @@ public:
     using Pass   = manylights::Pass<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
-        : Base(props), m_params(params), m_cache(params.splits_nodes()) {}
+        : Base(props), m_params(params),
+          m_cache(params.splits_nodes(), params.bsdf_samples > 0) {}
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
                     bool evaluate) override {

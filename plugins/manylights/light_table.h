@@ -59,12 +59,22 @@ template <typename Float, typename Spectrum> struct HostTable {
     bool needs_emitter_eval = false;
     /// Can a ray hit any light?
     bool can_be_hit = false;
-    /// Are there narrow spots? The axes of all bounds are then mean directions of emission
+    /// Emitters that only rays can find, and the name of the first one
+    uint32_t only_hit = 0;
+    std::string first_only_hit;
+    /// Factor of all fluxes of `bounds`, see \ref flux_scale
+    float scale = 1.f;
+    /// Do narrow spots matter? The axes of all bounds are then mean directions of emission
     bool beams = false;
 };
 
 /// Spots up to this angle are narrow: wider ones resemble a cosine
 constexpr float kWidestBeam = .5f;
+/**
+ * Narrow spots matter if they have this share of the tree's flux: where they have less, their
+ * noise is small, and lobes in place of harmonics for all lights take 1.2 times the time.
+ */
+constexpr double kLeastBeams = .01;
 
 template <typename Float, typename Spectrum> class LightTableReader {
 public:
@@ -79,9 +89,8 @@ public:
         reader.reserve();
         for (size_t i = 0; i < emitters.size(); ++i)
             reader.add(emitters[i].get(), (uint32_t) i);
-        if (!reader.m_table.beams)
-            reader.take_lobes_for_cosines();
         reader.estimate_unknown_powers();
+        reader.finish_bounds();
         reader.warn_of_invalid_lights();
         return std::move(reader.m_table);
     }
@@ -111,15 +120,21 @@ private:
         m_table.proportional.resize(m_scene->emitters().size(), false);
     }
 
-    /// Without narrow spots: unit axes, and the weights of spots (see LightBounds)
-    void take_lobes_for_cosines() {
+    /// Fluxes in units of the largest one; and where narrow spots do not matter, unit axes and
+    /// the weights of spots that go with them (see LightBounds)
+    void finish_bounds() {
+        m_table.beams = m_beam_flux > kLeastBeams * (m_other_flux + m_beam_flux);
+        m_table.scale = flux_scale(m_largest_flux > 0 ? m_largest_flux : m_infinite_flux);
         for_chunks(m_table.rows.size(), [&](size_t, size_t begin, size_t end) {
             for (size_t i = begin; i < end; ++i) {
                 LightBounds &bounds = m_table.bounds[i];
-                float length        = norm(bounds.axis);
+                bounds.flux = scaled_flux(light_flux(m_table.rows[i], m_table.beams),
+                                          m_table.scale);
+                if (m_table.beams)
+                    continue;
+                float length = norm(bounds.axis);
                 for (float &coordinate : bounds.axis)
                     coordinate /= length > 0 ? length : 1.f;
-                bounds.flux = light_flux(m_table.rows[i], /* beams = */ false);
             }
         });
     }
@@ -130,7 +145,9 @@ private:
         bool surface          = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
         bool directional      = has_flag(m_flags, mitsuba::EmitterFlags::DeltaDirection);
         std::string_view name = emitter->class_name();
-        if (surface && directional)
+        if (emitter->sampling_weight() == 0)
+            add_unsampled(emitter);
+        else if (surface && directional)
             ++m_table.light_count; // Mitsuba never connects to it: no contribution
         else if (surface && !emitter->shape())
             add_unattached(emitter);
@@ -145,12 +162,15 @@ private:
             m_table.infinite.push_back(emitter);
             Emission e = EmissionReader<Float, Spectrum>::read(emitter);
             note_invalid(!is_valid(e.brightness));
+            m_infinite_flux = std::max(m_infinite_flux, (double) e.brightness);
             m_table.proportional[index] = e.tabulated && e.brightness > 0;
         } else
             add_other(emitter);
     }
 
-    static bool is_valid(float power) { return std::isfinite(power) && power >= 0; }
+    static bool is_valid(double power) {
+        return std::isfinite((float) power) && power >= 0;
+    }
 
     /// Note lights of the current emitter whose power is not a finite number >= 0
     void note_invalid(uint32_t count) {
@@ -159,12 +179,17 @@ private:
         m_invalid += count;
     }
 
+    /// What users know an emitter by
+    static std::string name_of(const Emitter *emitter) {
+        const Shape *shape = emitter->shape();
+        return std::string(shape ? shape->id() : emitter->id());
+    }
+
     /// Without a word they would just be missing from the image
     void warn_of_invalid_lights() const {
         if (m_invalid == 0)
             return;
-        const Emitter *first = m_scene->emitters()[m_first_invalid].get();
-        std::string_view id  = first->shape() ? first->shape()->id() : first->id();
+        std::string id = name_of(m_scene->emitters()[m_first_invalid].get());
         Log(mitsuba::Warn,
             "Lights that are never chosen: %u of %u. Their power must not be negative, "
             "and power and position must be finite. The first one belongs to \"%s\".",
@@ -299,7 +324,7 @@ private:
     /// A sphere, disk or cylinder; its emission is not in the row if it varies
     LightRow make_quadric(LightKind kind, const Emitter *emitter, const Shape *shape,
                           Emission e, const float (&to_world)[3][4]) {
-        if (!e.tabulated)
+        if (!e.constant)
             e.brightness =
                 QuadricEmission<Float, Spectrum>(emitter, shape, kind, to_world)
                     .brightness(shown_image(emitter));
@@ -392,20 +417,22 @@ private:
         HostView normals(mesh->vertex_normals_buffer());
         HostView faces(mesh->faces_buffer());
         std::vector<Emission> varying;
-        if (!constant.tabulated)
+        if (!constant.constant)
             varying =
                 MeshEmission<Float, Spectrum>(emitter, mesh, shown_image(emitter)).read();
-        bool flipped = mesh->has_flipped_normals();
-        add_triangles(faces.size() / 3, [&](size_t f, LightRow &row,
-                                            LightBounds &bounds) {
-            const uint32_t *face = &faces[3 * f];
-            Side side            = emitting_side(vertices.data(), normals.data(), face);
-            if (flipped && side != Side::Both)
-                side = side == Side::Front ? Side::Back : Side::Front;
-            read_triangle(vertices.data(), face, varying.empty() ? constant : varying[f],
-                          (uint32_t) f, side, row, bounds);
-        });
-        if (!constant.tabulated)
+        bool flipped  = mesh->has_flipped_normals(),
+             attached = emission_has_gradient<Float>(emitter, mesh);
+        add_triangles(
+            faces.size() / 3, [&](size_t f, LightRow &row, LightBounds &bounds) {
+                const uint32_t *face = &faces[3 * f];
+                Side side = emitting_side(vertices.data(), normals.data(), face);
+                if (flipped && side != Side::Both)
+                    side = side == Side::Front ? Side::Back : Side::Front;
+                Emission e = varying.empty() ? constant : varying[f];
+                e.tabulated &= !attached;
+                read_triangle(vertices.data(), face, e, (uint32_t) f, side, row, bounds);
+            });
+        if (!constant.constant)
             m_table.proportional[m_emitter] = false;
     }
 
@@ -413,6 +440,7 @@ private:
     struct Part {
         uint32_t kept = 0, invalid = 0;
         bool by_plugin = false;
+        double flux = 0, largest = 0;
     };
 
     /// Add `count` lights, each read by `read(index, row, bounds)`, on all threads
@@ -429,11 +457,12 @@ private:
                 LightRow &row       = m_table.rows[light];
                 LightBounds &bounds = m_table.bounds[light];
                 read(i, row, bounds);
-                bounds.flux    = light_power(row);
-                float power    = usable_power(row, bounds);
+                double power   = usable_power(row, bounds);
                 bool kept      = is_valid(power) && power > 0,
                      by_plugin = !(row.tag & kTagTabulated);
                 part.invalid += !is_valid(power);
+                part.flux += kept ? power : 0;
+                part.largest = std::max(part.largest, kept ? power : 0);
                 part.by_plugin |= by_plugin;
                 m_table.light_of_primitive[primitive + i] =
                     kept ? (uint32_t) light : (by_plugin ? kOnlyHit : kNone);
@@ -447,10 +476,16 @@ private:
         if (m_table.rows.size() > first)
             m_table.kinds.insert(LightKind::Triangle);
         m_table.proportional[m_emitter] = m_table.rows.size() == first + count;
+        bool by_plugin                  = false;
         for (const Part &part : parts) {
-            m_table.needs_emitter_eval |= part.by_plugin;
+            by_plugin |= part.by_plugin;
+            m_other_flux += part.flux;
+            m_largest_flux = std::max(m_largest_flux, part.largest);
             note_invalid(part.invalid);
         }
+        m_table.needs_emitter_eval |= by_plugin;
+        if (by_plugin && m_table.rows.size() == first)
+            note_only_hit();
     }
 
     /// Move the lights of all chunks together
@@ -539,6 +574,26 @@ private:
 
     // --------------------------------------------------------------- Anything else
 
+    /// Mitsuba's sampling never chooses an emitter of weight 0, so that rays alone find it
+    void add_unsampled(const Emitter *emitter) {
+        ++m_table.light_count;
+        if (!has_flag(m_flags, mitsuba::EmitterFlags::Surface))
+            return;
+        m_table.needs_emitter_eval = m_table.can_be_hit = true;
+        push_only_hit(emitter);
+    }
+
+    /// All primitives of an emitter's shape
+    void push_only_hit(const Emitter *emitter) {
+        uint32_t first = (uint32_t) m_table.light_of_primitive.size();
+        m_table.light_of_primitive.push_back(kOnlyHit);
+        if (emitter->shape())
+            return m_table.shapes.push_back({ emitter->shape(), first, 1 });
+        for (const auto &shape : m_scene->shapes())
+            if (shape->emitter() == emitter)
+                m_table.shapes.push_back({ shape.get(), first, 1 });
+    }
+
     /// One light for the whole emitter, sampled by its plugin
     void add_other(const Emitter *emitter) {
         ScalarPoint3f low, high;
@@ -577,18 +632,14 @@ private:
     void estimate_unknown_powers() {
         if (!m_unknown_powers)
             return;
-        double sum   = 0;
         size_t known = 0;
-        for (size_t i = 0; i < m_table.rows.size(); ++i) {
-            sum += m_table.bounds[i].flux;
-            known += m_table.rows[i].brightness != kUnknownPower;
-        }
-        float mean = known ? (float) (sum / (double) known) : 1.f;
-        for (size_t i = 0; i < m_table.rows.size(); ++i)
-            if (m_table.rows[i].brightness == kUnknownPower) {
-                m_table.bounds[i].flux     = mean;
-                m_table.rows[i].brightness = mean / (4 * kPi);
-            }
+        for (const LightRow &row : m_table.rows)
+            known += row.brightness != kUnknownPower;
+        double mean    = known ? (m_beam_flux + m_other_flux) / (double) known : 1.;
+        m_largest_flux = std::max(m_largest_flux, mean);
+        for (LightRow &row : m_table.rows)
+            if (row.brightness == kUnknownPower)
+                row.brightness = (float) (mean / (4 * kPi));
         // It depends on all the others
         m_table.proportional.assign(m_table.proportional.size(), false);
     }
@@ -596,36 +647,48 @@ private:
     /// Some shapes (ellipsoidsmesh) do not tell their emitter about themselves
     void add_unattached(const Emitter *emitter) {
         add_only_hit();
-        uint32_t first = (uint32_t) m_table.light_of_primitive.size();
-        push_primitive((uint32_t) m_table.rows.size());
-        for (const auto &shape : m_scene->shapes())
-            if (shape->emitter() == emitter)
-                m_table.shapes.push_back({ shape.get(), first, 1 });
+        m_only_hit = false;
+        push_only_hit(emitter);
+    }
+
+    /// Note that no point is ever chosen on the current emitter
+    void note_only_hit() {
+        if (m_table.only_hit++ == 0)
+            m_table.first_only_hit = name_of(m_scene->emitters()[m_emitter].get());
     }
 
     /// Count a light that only rays can find
     void add_only_hit() {
+        note_only_hit();
         ++m_table.light_count;
         m_table.needs_emitter_eval = m_table.can_be_hit = true;
         m_only_hit                                      = true;
     }
 
     /// Some shapes of Mitsuba (curves) have no way to choose a point on them
-    static bool can_sample(const Emitter *emitter) {
+    bool can_sample(const Emitter *emitter) const {
         try {
             SurfaceInteraction3f si = dr::zeros<SurfaceInteraction3f>();
             auto [ds, weight]       = emitter->sample_direction(si, Point2f(.5f), true);
             (void) ds;
             (void) weight;
             return true;
-        } catch (const std::exception &) {
-            return false;
+        } catch (const std::exception &e) {
+            if (has_flag(m_flags, mitsuba::EmitterFlags::Surface))
+                return false;
+            throw std::runtime_error("manylights: the emitter \"" + name_of(emitter) +
+                                     "\" cannot be sampled: " + e.what());
         }
     }
 
     bool find_bounds(const Emitter *emitter, ScalarPoint3f &low,
                      ScalarPoint3f &high) const {
-        auto box   = emitter->bbox();
+        decltype(emitter->bbox()) box;
+        try {
+            box = emitter->shape() ? emitter->shape()->bbox() : emitter->bbox();
+        } catch (const std::exception &) { // written in Python, without one
+            return false;
+        }
         low        = box.min;
         high       = box.max;
         bool delta = has_flag(m_flags, mitsuba::EmitterFlags::DeltaPosition);
@@ -713,33 +776,38 @@ private:
     }
 
     /// Power that decides whether a light can be chosen; infinite without a finite place
-    static float usable_power(const LightRow &row, const LightBounds &bounds) {
-        bool finite = std::isfinite(bounds.flux) && std::isfinite(bounds.variance);
+    static double usable_power(const LightRow &row, const LightBounds &bounds) {
+        double power = light_power(row);
+        bool finite  = std::isfinite(power) && std::isfinite(bounds.variance);
         for (int i = 0; i < 3; ++i)
             finite &=
                 std::isfinite(bounds.box_min[i]) && std::isfinite(bounds.box_max[i]);
-        // The flux of a spot does not show the sign
-        return finite ? std::min(bounds.flux, row.brightness) : dr::Infinity<float>;
+        return finite ? power : dr::Infinity<double>;
     }
 
     /// Lights without power, and degenerate ones, stay out
-    void add_light(const LightRow &row, LightBounds bounds) {
+    void add_light(const LightRow &row, const LightBounds &bounds) {
         ++m_table.light_count;
         LightKind kind = (LightKind) (row.tag & kTagKindMask);
         bool hit_able  = has_flag(m_flags, mitsuba::EmitterFlags::Surface);
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
         m_table.can_be_hit |= hit_able;
-        bounds.flux = light_power(row);
-        float power = usable_power(row, bounds);
+        double power = usable_power(row, bounds);
         note_invalid(!is_valid(power));
         if (!is_valid(power) || power == 0) {
             m_only_hit = by_plugin; // black as far as the quadrature saw
+            if (by_plugin)
+                note_only_hit();
             return;
         }
         m_table.proportional[m_emitter] =
             kind != LightKind::Other && (row.tag & kTagTabulated);
-        m_table.beams |= kind == LightKind::Spot && row.geometry[6] < kWidestBeam;
+        bool beam   = kind == LightKind::Spot && row.geometry[6] < kWidestBeam,
+             known  = row.brightness != kUnknownPower;
+        double flux = known ? light_flux(row, /* beams = */ false) : 0;
+        (beam ? m_beam_flux : m_other_flux) += flux;
+        m_largest_flux = std::max(m_largest_flux, flux);
         m_table.kinds.insert(kind);
         m_table.rows.push_back(row);
         m_table.bounds.push_back(bounds);
@@ -761,6 +829,9 @@ private:
     uint32_t m_flags = 0;
     /// Is there a light with \ref kUnknownPower?
     bool m_unknown_powers = false;
+    /// Sums of the fluxes of narrow spots and of all else, the largest of all, and the largest
+    /// irradiance or radiance of lights without a place
+    double m_beam_flux = 0, m_other_flux = 0, m_largest_flux = 0, m_infinite_flux = 0;
     /// Lights that \ref note_invalid noted, and the index of the first one's emitter
     uint32_t m_invalid = 0, m_first_invalid = 0;
 

@@ -77,6 +77,9 @@ template <typename Float> struct TreeView {
     IndexStorage node_links;
     TopView<Float> top;
     uint32_t light_count = 0;
+    /// A power of two that brings the largest flux to [1, 2), and its inverse: importances and
+    /// targets are in these units, so that images do not depend on the unit of emission
+    Float scale = 1.f, unit = 1.f;
     KindSet kinds;
     Directions directions = Directions::All;
     /// What has been learnt of the lights' visibility, null if that is not wanted

@@ -35,7 +35,10 @@ private:
         const mitsuba::Object *object = nullptr;
 
         Search(const mitsuba::Object *root, std::string_view name) : rest(name) {
-            const_cast<mitsuba::Object *>(root)->traverse(this);
+            try {
+                const_cast<mitsuba::Object *>(root)->traverse(this);
+            } catch (const std::exception &) { // of a plugin written in Python
+            }
         }
 
         void put_value(std::string_view name, void *v, uint32_t,

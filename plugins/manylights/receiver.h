@@ -18,15 +18,18 @@ public:
     using FloatD = dr::detached_t<Float>;
     using MaskD  = dr::mask_t<FloatD>;
 
-    /// Positive wherever the value is not zero; invalid values are never chosen
-    static FloatD target(const Spectrum &value) {
-        UnpolarizedSpectrum v = mitsuba::unpolarized_spectrum(value);
-        Float result;
-        if constexpr (mitsuba::is_rgb_v<Spectrum>)
-            result = root_mean_square(v); // why: see emission_reader.h
-        else
-            result = dr::mean(v);
-        FloatD g = plain(result);
+    /// Positive wherever the value is not zero; invalid values are never chosen. In units of
+    /// the scene's brightest light if `scale` is that of its tree.
+    static FloatD target(const Spectrum &value, const FloatD &scale = 1.f) {
+        auto v = plain(mitsuba::unpolarized_spectrum(value)) * scale;
+        FloatD g;
+        if constexpr (mitsuba::is_rgb_v<Spectrum>) {
+            g = root_mean_square(v); // why: see emission_reader.h
+            // Where squares leave the range of floats the largest channel decides
+            g = dr::select(g < 1e-15f || g > 1e15f, dr::max(dr::abs(v)), g);
+        } else {
+            g = dr::mean(v);
+        }
         // Bounded, so that sums of targets and weights stay finite
         return dr::select(g > 0.f && dr::isfinite(g), dr::minimum(g, 1e25f), 0.f);
     }

@@ -97,9 +97,12 @@ public:
         m_can_be_hit         = table.can_be_hit;
         m_tree.kinds         = table.kinds;
         m_tree.directions    = directions(table);
-        m_lobes              = find_lobes(scene);
-        m_media              = Media<Float, Spectrum>::find(scene);
-        m_tree.light_count   = (uint32_t) table.rows.size();
+        m_only_hit           = table.only_hit;
+        m_first_only_hit     = table.first_only_hit;
+        set_scale(table.scale);
+        m_lobes            = find_lobes(scene);
+        m_media            = Media<Float, Spectrum>::find(scene);
+        m_tree.light_count = (uint32_t) table.rows.size();
 
         HostStorage<Storage> nodes;
         WideNode *nodes_begin = nullptr;
@@ -197,6 +200,18 @@ public:
         MediaKinds media = Media<Float, Spectrum>::find(scene);
         result.mix_common((uint32_t) find_lobes(scene) + 4 * media.bits());
         return result;
+    }
+
+    /// For integrators that trace no rays from surfaces to find lights with
+    void warn_of_lights_for_rays() const {
+        if (m_only_hit > 0)
+            Log(mitsuba::Warn,
+                "%u of the scene's emitters can only be found by rays, and are missing "
+                "because "
+                "\"bsdf_samples\" is 0: no point can be chosen on them, or no light was "
+                "found "
+                "on them. The first one belongs to \"%s\".",
+                m_only_hit, m_first_only_hit);
     }
 
     const Tree &tree() const { return m_tree; }
@@ -358,20 +373,27 @@ private:
         WideNode *nodes = (WideNode *) node_storage.open(m_tree.nodes);
         bool beams      = m_tree.directions == Directions::Beams;
         std::atomic<bool> valid{ replace_rows(scene, differentiated, rows) };
-        for_chunks(m_tree.light_count, [&](size_t, size_t begin, size_t end) {
+        std::vector<double> largest(chunk_count(m_tree.light_count), 0.);
+        for_chunks(m_tree.light_count, [&](size_t chunk, size_t begin, size_t end) {
             for (size_t i = begin; i < end; ++i) {
                 LightRow &row = rows[i];
                 uint32_t e    = index[row.tag >> kTagEmitterShift];
                 if (e != kNone)
                     set_emission(row, emission[e]);
-                float flux = light_flux(row, beams);
+                double flux = light_flux(row, beams);
                 if (!(flux > 0) || !std::isfinite(flux))
                     valid = false;
-                fluxes[i] = flux;
+                largest[chunk] = std::max(largest[chunk], flux);
             }
         });
         if (!valid)
             return false;
+        float scale = flux_scale(*std::max_element(largest.begin(), largest.end()));
+        for_chunks(m_tree.light_count, [&](size_t, size_t begin, size_t end) {
+            for (size_t i = begin; i < end; ++i)
+                fluxes[i] = scaled_flux(light_flux(rows[i], beams), scale);
+        });
+        set_scale(scale);
         refit_tree(nodes, m_statistics.nodes, fluxes);
         m_tree.top   = TopView<FloatD>(read_top(nodes));
         m_tree.rows  = row_storage.close();
@@ -429,6 +451,11 @@ private:
         return places;
     }
 
+    void set_scale(float scale) {
+        m_tree.scale = dr::opaque<FloatD>(scale);
+        m_tree.unit  = dr::opaque<FloatD>(1.f / scale);
+    }
+
     static void set_emission(LightRow &row, const Emission &e) {
         row.brightness = e.brightness;
         if (!(row.tag & kTagTabulated))
@@ -483,6 +510,9 @@ private:
     std::vector<const Emitter *> m_infinite;
     mitsuba::DynamicBuffer<EmitterPtr> m_infinite_dr;
     bool m_needs_emitter_eval = false, m_can_be_hit = false;
+    /// See HostTable
+    uint32_t m_only_hit = 0;
+    std::string m_first_only_hit;
     Lobes m_lobes = Lobes::None;
     MediaKinds m_media;
     Statistics m_statistics;
