@@ -1,7 +1,7 @@
-#include <manylights/direct_light.h>
-#include <manylights/export_plugin.h>
-#include <manylights/hidden_emitters.h>
-#include <manylights/light_integrator.h>
+#include <manylights/direct/direct_light.h>
+#include <manylights/plugin/export_plugin.h>
+#include <manylights/render/light_integrator.h>
+#include <manylights/scene/hidden_emitters.h>
 
 NAMESPACE_BEGIN(mitsuba)
 

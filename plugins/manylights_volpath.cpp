@@ -1,6 +1,6 @@
-#include <manylights/export_plugin.h>
-#include <manylights/light_integrator.h>
-#include <manylights/path_tracer.h>
+#include <manylights/paths/path_tracer.h>
+#include <manylights/plugin/export_plugin.h>
+#include <manylights/render/light_integrator.h>
 
 NAMESPACE_BEGIN(mitsuba)
 

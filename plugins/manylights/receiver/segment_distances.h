@@ -1,0 +1,90 @@
+#pragma once
+
+/**
+ * Single scattering along a segment of a ray in a homogeneous medium: distances that suit a
+ * light.
+ *
+ * The light that a segment receives from a point at the distance D of the ray grows like
+ * 1 / (D^2 + t^2), which free-flight sampling does not see: with a light next to the ray its
+ * variance is unbounded. So lights are chosen for the whole segment, and a distance for each
+ * of them, half of the time with equal angles as seen from the light (Kulla and Fajardo,
+ * "Importance Sampling Techniques for Path Tracing in Participating Media", 2012), half
+ * of the time in proportion to the transmittance: that of a random channel or wavelength
+ * where these differ.
+ */
+
+#include "segment_view.h"
+
+namespace manylights {
+
+/// Distances along a segment for one light
+template <typename Float> class SegmentDistances {
+public:
+    using Receiver = manylights::Receiver<Float>;
+    using UInt32   = dr::uint32_array_t<Float>;
+    using Vector3f = mitsuba::Vector<Float, 3>;
+
+    /// @param w  from the start of the segment to the light's centre
+    SegmentDistances(const Receiver &at, const Vector3f &w, const Float &variance)
+        : m_at(at),
+          m_view(-dr::dot(at.wi, w), dr::squared_norm(w), variance, at.nearby()),
+          m_angle(m_view.angle()) {}
+
+    /// @param channel  random, below \ref Receiver::channels
+    Float sample(const Float &u, const UInt32 &channel) const {
+        Float v = 2.f * u;
+        return dr::select(v < 1.f, sample_equiangular(v),
+                          sample_transmittance(m_at, v - 1.f, channel));
+    }
+
+    Float pdf(const Float &t) const {
+        Float offset = t - m_view.nearest, d2 = dr::square(m_view.distance);
+        Float equiangular = m_view.distance / (m_angle * dr::fmadd(offset, offset, d2));
+        equiangular       = dr::select(t <= m_view.length, equiangular, 0.f);
+        return .5f * (equiangular + transmittance_pdf(m_at, t));
+    }
+
+    /// Density proportional to a channel's transmittance, or constant if that hardly changes
+    static Float sample_transmittance(const Receiver &at, const Float &u,
+                                      const UInt32 &channel) {
+        Float extinction = at.extinction;
+        for (uint32_t i = 0; i < at.channels; ++i)
+            extinction = dr::select(channel == i, at.extinctions.entry(i), extinction);
+        Float depth = extinction * at.length;
+        Float t     = -dr::log(1.f - u * (1.f - dr::exp(-depth))) / extinction;
+        return dr::minimum(dr::select(depth < kThin, u * at.length, t), at.length);
+    }
+    static Float transmittance_pdf(const Receiver &at, const Float &t) {
+        if (at.channels == 0)
+            return exponential_pdf(at.extinction, at.length, t);
+        Float sum(0.f);
+        for (uint32_t i = 0; i < at.channels; ++i)
+            sum += exponential_pdf(at.extinctions.entry(i), at.length, t);
+        return sum * (1.f / at.channels);
+    }
+
+private:
+    static constexpr float kThin = .02f;
+
+    static Float exponential_pdf(const Float &extinction, const Float &length,
+                                 const Float &t) {
+        Float depth = extinction * length;
+        Float pdf   = extinction * dr::exp(-extinction * t) / (1.f - dr::exp(-depth));
+        return dr::select(depth < kThin, dr::rcp(length), pdf);
+    }
+
+    /// n^2 sin / (D cos + nearest sin) with the angle from the segment's start, at a distance
+    /// n from the light: no difference of large numbers
+    Float sample_equiangular(const Float &v) const {
+        auto [sin, cos] = dr::sincos(v * m_angle);
+        Float n2        = dr::square(m_view.nearest) + dr::square(m_view.distance);
+        Float t = n2 * sin / dr::fmadd(m_view.distance, cos, m_view.nearest * sin);
+        return dr::clip(t, 0.f, m_view.length);
+    }
+
+    const Receiver &m_at;
+    SegmentView<Float, Float> m_view;
+    Float m_angle;
+};
+
+} // namespace manylights

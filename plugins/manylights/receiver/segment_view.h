@@ -1,0 +1,34 @@
+#pragma once
+
+/// A light as seen from a segment of a ray in fog.
+
+#include "receiver.h"
+
+namespace manylights {
+
+/// A light as seen from a segment that starts at the origin and goes along `d`
+template <typename Value, typename Float> struct SegmentView {
+    /// Distance of the nearest point of the line from the segment's start; the light's
+    /// distance from the line, with its own extent
+    Value nearest, distance;
+    Float length;
+
+    SegmentView(const Value &along, const Value &norm2, const Value &variance,
+                const Float &length)
+        : nearest(along), length(length) {
+        Value off2 = dr::maximum(dr::fnmadd(along, along, norm2), 0.f);
+        distance   = dr::sqrt(dr::fmadd(norm2, 1e-7f, off2 + variance) + 1e-30f);
+    }
+
+    /// The angle that the segment fills
+    Value angle() const {
+        Value beyond = length - nearest;
+        return dr::atan2(length * distance,
+                         dr::fnmadd(nearest, beyond, distance * distance));
+    }
+
+    /// Point of the segment that is nearest to the light
+    Value closest() const { return dr::clip(nearest, 0.f, length); }
+};
+
+} // namespace manylights
