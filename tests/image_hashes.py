@@ -1,0 +1,99 @@
+"""Hashes of images, to show that a change of the code keeps every bit.
+
+    python -m tests.image_hashes -o before.json
+    python -m tests.image_hashes --compare before.json
+
+All scene files and some generators are rendered small, with both integrators, all methods, with and
+without learning, on one thread. Compare builds with the same compiler and flags: where calls are
+inlined differently, scalar variants may round the last bits differently.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from manylights.threads import threads_for_files
+
+SCENES = Path(__file__).parents[1] / "scenes"
+VARIANTS = "scalar_rgb,scalar_spectral,llvm_ad_rgb,llvm_ad_mono_polarized"
+SIZE = {"width": 32, "height": 24}
+METHODS = ("resampled_tree", "talk", "adaptive_splitting", "tree", "exhaustive")
+GENERATORS = {
+    "city": lambda s: s.city(200, **SIZE, spp=4),
+    "city-points": lambda s: s.city(200, kind="points", **SIZE, spp=4),
+    "house": lambda s: s.house(200, **SIZE, spp=4),
+    "glossy": lambda s: s.glossy(200, **SIZE, spp=4),
+    "fog_rooms": lambda s: s.fog_rooms(60, **SIZE, spp=4),
+}
+
+
+def settings(plugin: str) -> list[dict]:
+    """The parameters that each scene is rendered with."""
+    common = [{"type": plugin, "method": method} for method in METHODS]
+    common += [{"type": plugin, "learn_visibility": False}, {"type": plugin, "splitting_rate": 4}]
+    depth = {"max_depth": 4} if plugin == "manylights_volpath" else {}
+    return [each | depth for each in common]
+
+
+def scenes() -> dict:
+    """Functions without arguments that load a scene, by name."""
+    import manylights
+
+    found = {
+        path.stem: lambda path=path: mi.load_file(str(path), spp=4, resx=32, resy=24)
+        for path in sorted(SCENES.glob("*.xml"))
+    }
+    for name, make in GENERATORS.items():
+        found[name] = lambda make=make: mi.load_dict(make(manylights.scenes))
+    return found
+
+
+def hashes(variant: str) -> dict[str, str]:
+    """SHA-256 of each image, by scene and parameters."""
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    result = {}
+    for name, load in scenes().items():
+        # With one thread Mitsuba waits for ever for some files
+        with threads_for_files():
+            scene = load()
+        dr.set_thread_count(1)
+        for plugin in ("manylights_direct", "manylights_volpath"):
+            for each in settings(plugin):
+                key = " ".join([variant, name, *(str(value) for value in each.values())])
+                image = np.array(mi.render(scene, integrator=mi.load_dict(each), spp=4, seed=1))
+                result[key] = hashlib.sha256(np.ascontiguousarray(image)).hexdigest()
+        print(variant, name, file=sys.stderr, flush=True)
+    return result
+
+
+def main() -> int:
+    """Write hashes, or compare them with those of a file; exit status 1 if any differ."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--variants", default=VARIANTS)
+    parser.add_argument("-o", "--output")
+    parser.add_argument("--compare")
+    options = parser.parse_args()
+    found = {}
+    for variant in options.variants.split(","):
+        found |= hashes(variant)
+    if options.output:
+        Path(options.output).write_text(json.dumps(found, indent=1))
+    if not options.compare:
+        return 0
+    before = json.loads(Path(options.compare).read_text())
+    changed = [key for key, value in found.items() if before.get(key) != value]
+    print(*(f"differs: {key}" for key in changed), sep="\n")
+    print(f"{len(found) - len(changed)} of {len(found)} images are the same")
+    return int(bool(changed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
