@@ -198,6 +198,18 @@ def test_bare_intensity_needs_the_switch(load):
 
 
 @pytest.mark.parametrize(
+    "kind, expected",
+    [("SphereLight", 3), ("DistantLight", 12), ("RectLight", 3 * np.pi / 4)],
+)
+def test_units_of_blender(load, kind, expected):
+    text = f'def {kind} "a" {{;float inputs:intensity = 3;float inputs:angle = 0;}}'
+    scene = load(text, blender_light_units=True)
+    (part,) = (part for name, part in scene.items() if name.startswith("light_"))
+    value = part["irradiance"] if kind == "DistantLight" else part["emitter"]["radiance"]
+    assert color(value) == pytest.approx([expected] * 3)
+
+
+@pytest.mark.parametrize(
     "what, time, expected",
     [("samples only", None, 4), ("start", None, 6), ("start", 2, 8), ("default", None, 1)],
 )

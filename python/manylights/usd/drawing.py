@@ -11,7 +11,8 @@ from manylights.usd.context import Context
 from manylights.usd.copies import copies
 from manylights.usd.description import transformed
 from manylights.usd.geometry import surfaces_of
-from manylights.usd.lights import Lights, transform
+from manylights.usd.light_shapes import transform
+from manylights.usd.lights import Lights
 from manylights.usd.materials import Materials
 from manylights.usd.mitsuba_meshes import checked_uv
 from manylights.usd.shining import MOST_TRIANGLES, Glow, MeshLight, add_lamps, glow_of, world_areas
