@@ -625,3 +625,35 @@ def test_emissive_picture(load, tmp_path):
     scene = load(f'{glow};def Mesh "quad" {{;{quad}{st}{BOUND}{placed(z=0.5)}}}')
     expected = 1e-4 / 0.25 * QUARTERS.mean(axis=(0, 1))
     assert_irradiance(scene, expected, rounding=0.005, size=0.001)
+
+
+def test_plain_light_on_a_mesh_ignores_its_material(load):
+    """LightAPI alone has no response of the material, MeshLightAPI tints."""
+    scene = load(mesh_light("float inputs:intensity = 4;" + placed(), api="LightAPI"))
+    assert_irradiance(scene, 4 * per_area())
+
+
+def test_subset_that_glows(load):
+    """Of two squares the one in the subset emits: its flux is pi times radiance and area."""
+    mesh = """def Mesh "pair" { ; int[] faceVertexCounts = [4, 4]
+        int[] faceVertexIndices = [0, 1, 2, 3, 4, 5, 6, 7]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0),
+            (2, 0, 0), (3, 0, 0), (3, 1, 0), (2, 1, 0)]
+        def GeomSubset "part" (prepend apiSchemas = ["MaterialBindingAPI"]) { ;
+            uniform token elementType = "face"; uniform token familyName = "materialBind"
+            int[] indices = [1]; rel material:binding = </glow>; } };"""
+    scene = mi.load_dict(load(GLOW.replace("(1, 0.5, 0.25)", "(5, 5, 5)") + ";" + mesh))
+    shining = [shape for shape in scene.shapes() if shape.is_emitter()]
+    radiance = [shape.emitter().eval(front_of(shape))[0] for shape in shining]
+    assert radiance == pytest.approx([5])
+    assert sum(shape.surface_area() for shape in shining) == pytest.approx(1)
+    assert sum(shape.surface_area() for shape in scene.shapes()) == pytest.approx(2)
+
+
+@pytest.mark.parametrize("unit", [1, 0.01])
+def test_units_of_length_change_nothing(load, unit):
+    scene = load(f'def SphereLight "a" {{;{placed()}}}', {"metersPerUnit": unit})
+    (part,) = emitters(scene, "sphere")
+    assert (part["radius"], part["center"]) == (0.5, [0, 0, 5])
+    assert color(part["emitter"]["radiance"]) == pytest.approx([1] * 3)
+    assert scene.metadata["metersPerUnit"] == pytest.approx(unit)
