@@ -503,6 +503,40 @@ def test_periodic_curve_is_a_ring():
     assert area(surface) == pytest.approx(4 * np.pi**2 * 0.01, rel=1e-3)
 
 
+@pytest.mark.parametrize("wrap", ["nonperiodic", "pinned"])
+def test_values_of_several_curves_follow_them(wrap):
+    # Curves of 5, 4 and 5 points along y at x = 0, 1 and 2; widths and colors grow along them
+    counts = [5, 4, 5]
+    places = [(x, y, 0) for x, count in enumerate(counts) for y in range(count)]
+    spans = [count - 1 if wrap == "pinned" else count - 3 for count in counts]
+    varying = [0.1 * (x + 1) for x, span in enumerate(spans) for _ in range(span + 1)]
+    surface = only(f"""def BasisCurves "a" {{
+        uniform token basis = "catmullRom"
+        uniform token wrap = "{wrap}"
+        int[] curveVertexCounts = {counts}
+        point3f[] points = {places}
+        float[] widths = {varying} (
+            interpolation = "varying"
+        )
+        color3f[] primvars:displayColor = [(.1, 0, 0), (.2, 0, 0), (.3, 0, 0)] (
+            interpolation = "uniform"
+        )
+        texCoord2f[] primvars:st = {[place[:2] for place in places]} (
+            interpolation = "vertex"
+        )
+    }}""")
+    sizes = np.linalg.norm(area_vectors(surface), axis=1)
+    for curve, span in enumerate(spans):
+        mine = surface.face_of == curve
+        assert sizes[mine].sum() == pytest.approx(np.pi * 0.1 * (curve + 1) * span, rel=1e-5)
+        vertices = surface.faces[mine]
+        assert surface.colors[vertices][..., 0] == pytest.approx(0.1 * (curve + 1))
+        assert surface.uv[vertices][..., 0] == pytest.approx(curve, abs=1e-6)
+        assert surface.uv[vertices][..., 1] == pytest.approx(
+            surface.positions[vertices][..., 1], abs=1e-5
+        )
+
+
 def test_broken_curves_are_noted():
     surfaces, notes = read("""def BasisCurves "a" {
         int[] curveVertexCounts = [9]
@@ -523,3 +557,87 @@ def test_types_that_are_left_out_are_noted():
     surfaces, notes = read('def NurbsPatch "a" {\n}')
     assert not surfaces and notes[0].kind == "NurbsPatch"
     assert corners(only('def Cube "a" {}')).shape == (12, 3, 3)
+
+
+# --- anything at all ---
+
+small = st.integers(-2, 7)
+coordinate = st.one_of(st.floats(-2, 2, width=32), st.sampled_from([np.nan, np.inf, 1e38, 0.0]))
+points = st.lists(st.tuples(coordinate, coordinate, coordinate), max_size=7)
+
+
+def text_of(value):
+    """Return a number, or several, as USD writes them."""
+    if isinstance(value, (list, tuple)):
+        inside = ", ".join(text_of(part) for part in value)
+        return f"[{inside}]" if isinstance(value, list) else f"({inside})"
+    return repr(value)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    values=st.fixed_dictionaries(
+        {
+            "int[] faceVertexCounts": st.lists(st.integers(-1, 6), max_size=4),
+            "int[] faceVertexIndices": st.lists(small, max_size=12),
+            "point3f[] points": points,
+            "int[] holeIndices": st.lists(small, max_size=2),
+            "int[] creaseIndices": st.lists(small, max_size=4),
+            "int[] creaseLengths": st.lists(small, max_size=2),
+            "float[] creaseSharpnesses": st.lists(coordinate, max_size=2),
+            "int[] cornerIndices": st.lists(small, max_size=2),
+            "float[] cornerSharpnesses": st.lists(coordinate, max_size=2),
+            "normal3f[] normals": points,
+        }
+    ),
+    scheme=st.sampled_from(["none", "catmullClark", "loop", "bilinear"]),
+    interpolation=st.sampled_from(sorted(COUNTS)),
+    color=points,
+    valid=st.booleans(),
+)
+def test_no_mesh_breaks_the_reader(values, scheme, interpolation, color, valid):
+    if valid and values["point3f[] points"]:
+        counts = [max(count, 0) for count in values["int[] faceVertexCounts"]]
+        number = len(values["point3f[] points"])
+        values["int[] faceVertexCounts"] = counts
+        values["int[] faceVertexIndices"] = [(3 * i) % number for i in range(sum(counts))]
+    lines = [f"{name} = {text_of(value)}" for name, value in values.items()]
+    lines.append(f'uniform token subdivisionScheme = "{scheme}"')
+    how = f'(\ninterpolation = "{interpolation}"\n)'
+    lines.append(f"color3f[] primvars:displayColor = {text_of(color)} {how}")
+    surfaces, notes = read(mesh("\n".join([*lines, subset("s", [0, 2])])))
+    assert surfaces or notes
+    for surface in surfaces:
+        assert len(surface.faces) and surface.faces.max() < len(surface.positions)
+        assert np.isfinite(surface.positions).all()
+        assert len(surface.face_of) == len(surface.faces)
+        assert surface.normals is None or np.isfinite(surface.normals).all()
+        assert surface.colors is None or np.isfinite(surface.colors).all()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    counts=st.lists(st.integers(-1, 8), max_size=3),
+    places=points,
+    widths=st.lists(coordinate, max_size=4),
+    kind=st.sampled_from(["linear", "cubic"]),
+    basis=st.sampled_from(["bezier", "bspline", "catmullRom"]),
+    wrap=st.sampled_from(["nonperiodic", "periodic", "pinned"]),
+    valid=st.booleans(),
+)
+def test_no_curves_break_the_reader(counts, places, widths, kind, basis, wrap, valid):
+    counts = [len(places)] if valid else counts
+    surfaces, notes = read(f"""def BasisCurves "a" {{
+        int[] curveVertexCounts = {counts}
+        point3f[] points = {text_of(places)}
+        float[] widths = {text_of(widths)} (
+            interpolation = "vertex"
+        )
+        uniform token type = "{kind}"
+        uniform token basis = "{basis}"
+        uniform token wrap = "{wrap}"
+    }}""")
+    assert surfaces or notes
+    for surface in surfaces:
+        assert surface.faces.max() < len(surface.positions)
+        assert np.isfinite(surface.positions).all()

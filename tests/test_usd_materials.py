@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from manylights.usd.geometry import surfaces_of
 from manylights.usd.materials import Materials
-from manylights.usd.mitsuba_meshes import in_world, join, mesh_of
+from manylights.usd.mitsuba_meshes import in_world, join, kind_of, mesh_of
 from manylights.usd.textures import scaled
 from pxr import Usd, UsdUtils
 
@@ -288,13 +288,22 @@ def emissive(folder, extra="", body=ST + BOUND, nodes=""):
     return stage_of(square(body) + preview(connected("emissiveColor"), node + nodes), folder)
 
 
+def shown_quarters(folder):
+    """Return the four corners of a picture of the image: its first row is the top one."""
+    clamp = 'token inputs:wrapS = "clamp"\ntoken inputs:wrapT = "clamp"'
+    return picture(emissive(folder, clamp), size=4, light=0, emission=True)[::3, ::3]
+
+
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_images_are_upright_and_not_mirrored(tmp_path, variant):
     require_variant(variant)
-    clamp = 'token inputs:wrapS = "clamp"\ntoken inputs:wrapT = "clamp"'
-    image = picture(emissive(tmp_path, clamp), size=4, light=0, emission=True)
-    # Mitsuba's first row is the top one
-    assert image[::3, ::3] == pytest.approx(QUARTERS, abs=1e-3)
+    assert shown_quarters(tmp_path) == pytest.approx(QUARTERS, abs=1e-3)
+
+
+@pytest.mark.parametrize("planted", [lambda uv: uv, lambda uv: 1 - uv])
+def test_planted_mirrors_are_found(tmp_path, monkeypatch, planted):
+    monkeypatch.setattr("manylights.usd.mitsuba_meshes.to_mitsuba_uv", planted)
+    assert shown_quarters(tmp_path) != pytest.approx(QUARTERS, abs=0.5)
 
 
 @pytest.mark.parametrize(
@@ -761,6 +770,19 @@ def test_open_pbr_surface_and_its_fallbacks():
     assert material.emission["value"] == [5, 5, 5]
 
 
+def test_unlit_surface_only_emits():
+    inputs = "float inputs:emission = 2\ncolor3f inputs:emission_color = (1, .5, 0)"
+    material, notes = material_of(square() + mtlx("ND_surface_unlit", inputs))
+    assert material.emission["value"] == [2, 1, 0] and not notes
+    assert principled(material)["base_color"]["value"] == [0, 0, 0]
+
+
+def test_black_emissive_images_make_no_lights(tmp_path):
+    write(tmp_path, "i.png", np.zeros((4, 4, 3), dtype=np.uint8))
+    text = square() + preview(connected("emissiveColor"), image_node("i.png"))
+    assert material_of(text, tmp_path)[0].emission is None
+
+
 def test_images_of_material_x(tmp_path):
     quarters(tmp_path)
     nodes = """
@@ -901,16 +923,19 @@ def test_mirrored_lamps_shine_to_their_outside():
 
 def test_joined_surfaces_keep_area_colors_and_places():
     body = 'color3f[] primvars:displayColor = [(.2, .4, .6)] (\ninterpolation = "uniform"\n)'
-    one = only(square(body + ST))
+    stage = stage_of(square(body + ST))
+    context = context_of(stage)
+    one = surfaces_of(stage.GetPrimAtPath("/a"), context)[0]
+    material = Materials(context).of(one)
     shift = np.eye(4)
     shift[0, 3] = 10
-    both = join([one, in_world(one, shift)])
+    other = in_world(one, shift)
+    assert kind_of(one, material) == kind_of(other, material)
+    both = join([one, other], material)
     assert area(both) == pytest.approx(8) and len(both.colors) == 4
     assert both.positions[:, 0].max() == pytest.approx(11)
-    stage = stage_of(square(body + ST))
-    both.binding = stage.GetPrimAtPath("/a")
-    material = Materials(context_of(stage)).of(both)
-    mesh = mesh_of(both, material, context_of(stage), name="both")
+    assert both.uv == pytest.approx(np.concatenate([one.uv, one.uv]))
+    mesh = mesh_of(both, material, context, name="both")
     assert mesh.face_count() == 4 and mesh.id() == "both"
     assert mesh.surface_area() == pytest.approx(8)
 
@@ -920,3 +945,50 @@ def test_meshes_with_zero_normals_have_those_of_their_faces():
     meshes, _ = meshes_of(stage_of(square(body)))
     normals = np.array(mi.traverse(meshes["mesh0"])["vertex_normals"]).reshape(-1, 3)
     assert normals == pytest.approx(np.tile([0, 0, 1], (4, 1)))
+
+
+# --- anything at all ---
+
+odd_values = st.sampled_from(
+    [
+        *("float {} = nan", "float {} = inf", "float {} = -3", "int {} = 2", 'string {} = "a"'),
+        *("color3f {} = (2, nan, -1)", "float2 {} = (1, 2)", "token {}", "asset {} = @none.png@"),
+        *("float {} = None", "float[] {} = [1, 2]", "float {}.connect = </m/gone.outputs:out>"),
+        *("float4 {} = (1, 2, 3, 4)", "float {}.connect = </m.inputs:gone>", "bool {} = true"),
+        "float {}.connect = </m/s.outputs:surface>",
+    ]
+)
+INPUTS = (
+    *("diffuseColor", "roughness", "metallic", "ior", "clearcoat", "clearcoatRoughness", "opacity"),
+    *("opacityThreshold", "emissiveColor", "normal", "useSpecularWorkflow", "specularColor"),
+    *("displacement", "occlusion", "opacityMode"),
+)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.dictionaries(st.sampled_from(INPUTS), odd_values, max_size=4))
+def test_no_input_of_a_surface_breaks_the_reader(inputs):
+    lines = "\n".join(text.format(f"inputs:{name}") for name, text in inputs.items())
+    material, _ = material_of(square() + preview(lines))
+    material.bsdf_object()
+    if material.emission:
+        mi.load_dict({"type": "area", "radiance": material.emission})
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.dictionaries(
+        st.sampled_from(
+            ("file", "st", "scale", "bias", "fallback", "wrapS", "wrapT", "sourceColorSpace")
+        ),
+        odd_values,
+        max_size=3,
+    )
+)
+def test_no_input_of_a_texture_breaks_the_reader(inputs):
+    lines = "\n".join(text.format(f"inputs:{name}") for name, text in inputs.items())
+    lines = 'uniform token info:id = "UsdUVTexture"\n' + lines
+    node = f'def Shader "t" {{\n{lines}\nfloat3 outputs:rgb\n}}'
+    text = square() + preview(connected("diffuseColor"), node)
+    meshes, _ = meshes_of(stage_of(text))
+    assert len(meshes) == 1

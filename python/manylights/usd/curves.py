@@ -78,36 +78,39 @@ def surfaces_of_curves(prim, context) -> list[Surface]:
     ]
 
 
-def _pieces(counts, linear: bool, basis: str, wrap: str) -> Pieces:
+def _pieces(counts: np.ndarray, linear: bool, basis: str, wrap: str) -> Pieces:
     """Return the segments of curves with these numbers of points."""
-    parts, phantoms, ends, owner = [], [], [], []
-    begin = varying = 0
-    total = int(counts.sum())
-    for number, count in enumerate(counts):
-        indices = np.arange(begin, begin + count)
-        begin += count
-        if wrap == "pinned" and not linear and basis != "bezier" and count > 1:
-            first = total + len(phantoms)
-            phantoms += [(indices[0], indices[1]), (indices[-1], indices[-2])]
-            indices = np.array([first, *indices, first + 1])
-        width, step = (2, 1) if linear else (4, 3 if basis == "bezier" else 1)
-        if wrap == "periodic" and count:
-            indices = np.concatenate([indices, indices[: width - step]])
-        segments = max((len(indices) - width) // step + 1, 0)
-        parts.append(indices[step * np.arange(segments)[:, None] + np.arange(width)])
-        values = segments if wrap == "periodic" else segments + 1
-        places = varying + np.arange(segments)[:, None] + np.arange(2)
-        ends.append(varying + (places - varying) % max(values, 1))
-        varying += values
-        owner += [number] * segments
+    total, begins = int(counts.sum()), np.cumsum(counts) - counts
+    periodic, pinned = wrap == "periodic", wrap == "pinned" and not linear and basis != "bezier"
+    width, step = (2, 1) if linear else (4, 3 if basis == "bezier" else 1)
+    longer = counts + (2 if pinned else width - step if periodic else 0)
+    segments = np.where(counts > 1, np.maximum((longer - width) // step + 1, 0), 0)
+    values = segments if periodic else segments + 1
+    varying = np.cumsum(values) - values
+    parts, phantoms, ends, owner = [np.zeros((0, width), dtype=np.int64)], [], [], []
+    for count in np.unique(counts[segments > 0]):
+        chosen = np.flatnonzero(counts == count)
+        number = segments[chosen[0]]
+        indices = begins[chosen, None] + np.arange(count)
+        if pinned:
+            first = total + 2 * (sum(map(len, phantoms)) // 2 + np.arange(len(chosen)))
+            phantoms.append(indices[:, [0, 1, -1, -2]].reshape(-1, 2))
+            indices = np.concatenate([first[:, None], indices, first[:, None] + 1], axis=1)
+        if periodic:
+            indices = np.concatenate([indices, indices[:, : width - step]], axis=1)
+        places = step * np.arange(number)[:, None] + np.arange(width)
+        parts.append(indices[:, places].reshape(-1, width))
+        along = (np.arange(number)[:, None] + np.arange(2)) % values[chosen[0]]
+        ends.append((varying[chosen, None, None] + along).reshape(-1, 2))
+        owner.append(np.repeat(chosen, number))
     return Pieces(
         control=np.concatenate(parts),
-        phantoms=np.array(phantoms, dtype=np.int64).reshape(-1, 2),
-        ends=np.concatenate(ends),
-        curve=np.array(owner, dtype=np.int64),
+        phantoms=np.concatenate([np.zeros((0, 2), dtype=np.int64), *phantoms]),
+        ends=np.concatenate([np.zeros((0, 2), dtype=np.int64), *ends]),
+        curve=np.concatenate([np.zeros(0, dtype=np.int64), *owner]),
         curves=len(counts),
         points=total,
-        varying=varying,
+        varying=int(values.sum()),
     )
 
 

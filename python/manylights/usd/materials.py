@@ -21,6 +21,7 @@ READERS = {
     "ND_UsdPreviewSurface_surfaceshader": preview_surface,
     "ND_standard_surface_surfaceshader": materialx.standard_surface,
     "ND_open_pbr_surface_surfaceshader": materialx.open_pbr,
+    "ND_surface_unlit": materialx.surface_unlit,
     "mdl:OmniPBR": omni_pbr,
     "mdl:OmniPBR_Opacity": omni_pbr,
 }
@@ -160,12 +161,7 @@ def with_own_lookups(look: Look) -> Look:
 
 def surface_shaders(material) -> list:
     """Return names and shaders of all surface outputs: Mitsuba's own first, then the universal."""
-    outputs = [output for output in material.GetOutputs() if output.GetBaseName() == "surface"]
-    outputs += [
-        output
-        for output in material.GetOutputs()
-        if output.GetFullName().endswith(":surface") and output not in outputs
-    ]
+    outputs = [o for o in material.GetOutputs() if str(o.GetFullName()).endswith(":surface")]
     order = {"outputs:mitsuba:surface": 0, "outputs:surface": 1, "outputs:mtlx:surface": 2}
     outputs = sorted(outputs, key=lambda output: order.get(str(output.GetFullName()), 3))
     found = []

@@ -13,7 +13,10 @@ from manylights.usd.shading import (
     Attribute,
     Lookup,
     constant,
+    constant_like,
     evaluate,
+    evaluate_like,
+    like,
     texture_coordinate,
 )
 
@@ -42,7 +45,7 @@ def evaluate_node(shader, output, context, depth: int):
         return Attribute(str(geomprop or ""), constant(shader, "default", context))
     channel = CHANNELS.get(UsdShade.Utils.GetBaseNameAndType(output.GetName())[0])
     if name.startswith("extract_"):
-        channel = "rgba"[min(max(int(constant(shader, "index", context, 0)), 0), 3)]
+        channel = "rgba"[int(np.clip(constant_like(shader, "index", context, 0), 0, 3))]
     elif name.startswith("swizzle_"):
         letters = str(constant(shader, "channels", context, ""))
         channel = letters if letters in ("r", "g", "b", "a") else None
@@ -58,8 +61,8 @@ def evaluate_node(shader, output, context, depth: int):
         return found
     if isinstance(found, Lookup):
         found.channel = channel
-    elif np.ndim(found):
-        found = found["rgba".index(channel)]
+    elif np.size(found) > 1:
+        found = found[min("rgba".index(channel), np.size(found) - 1)]
     return found
 
 
@@ -84,16 +87,12 @@ def _scaled(found, factor, shader, context):
         return found
     if isinstance(found, Attribute):
         return found
-    four = np.ones(4)
-    four[: 3 if np.ndim(factor) else 4] = np.array(factor)[:3] if np.ndim(factor) else factor
+    three = np.array(like(factor, (1.0, 1.0, 1.0), shader, context))
     if isinstance(found, Lookup):
+        four = np.append(three, three.mean())
         found.scale, found.bias = found.scale * four, found.bias * four
         return found
-    return (
-        tuple(np.array(found) * np.array(factor))
-        if np.ndim(found) or np.ndim(factor)
-        else found * factor
-    )
+    return tuple(np.array(like(found, (1.0, 1.0, 1.0), shader, context)) * three)
 
 
 def _image(shader, name: str, context) -> Lookup:
@@ -101,13 +100,13 @@ def _image(shader, name: str, context) -> Lookup:
     lookup = Lookup(shader.GetInput("file"), shader, "r" if number else "rgb")
     default = constant(shader, "default", context)
     if default is not None:
-        lookup.fallback = np.append(np.broadcast_to(np.array(default, dtype=float)[..., :3], 3), 1)
+        lookup.fallback = np.array([*like(default, (0.0, 0.0, 0.0), shader, context), 1.0])
     modes = [constant(shader, f"{axis}addressmode", context, "periodic") for axis in "uv"]
     lookup.wrap = tuple(WRAPS.get(mode, str(mode)) for mode in modes)
     lookup.primvar, lookup.to_uv = texture_coordinate(shader.GetInput("texcoord"), context)
     if name.startswith("tiledimage_"):
-        tiling = constant(shader, "uvtiling", context, (1, 1))
-        offset = constant(shader, "uvoffset", context, (0, 0))
+        tiling = constant_like(shader, "uvtiling", context, (1, 1))
+        offset = constant_like(shader, "uvoffset", context, (0, 0))
         tiles = np.array([[tiling[0], 0, -offset[0]], [0, tiling[1], -offset[1]], [0, 0, 1]])
         lookup.to_uv = tiles @ lookup.to_uv
     return lookup
@@ -121,8 +120,7 @@ class _Inputs:
 
     def any(self, name: str, fallback):
         """Return what feeds an input."""
-        found = evaluate(self.shader.GetInput(name), self.context)
-        return fallback if found is None else found
+        return evaluate_like(self.shader, name, self.context, fallback)
 
     def number(self, name: str, fallback: float) -> float:
         """Return a number; an image in its place is noted."""
@@ -131,7 +129,7 @@ class _Inputs:
             text = f"images on inputs like {name} are not used"
             self.context.notes.add("textured input", text, self.shader)
             return fallback
-        return float(np.mean(found))
+        return found
 
 
 def standard_surface(shader, context) -> Look:
@@ -174,6 +172,19 @@ def open_pbr(shader, context) -> Look:
     )
     _note_rest(inputs, ("transmission_weight", "subsurface_weight", "fuzz_weight"))
     return look
+
+
+def surface_unlit(shader, context) -> Look:
+    """Read an ND_surface_unlit: emission alone."""
+    inputs = _Inputs(shader, context)
+    return Look(
+        base_color=(0.0, 0.0, 0.0),
+        specular_color=(0.0, 0.0, 0.0),
+        opacity=inputs.any("opacity", 1.0),
+        presence=True,
+        emission=inputs.any("emission_color", (1.0, 1.0, 1.0)),
+        emission_weight=inputs.number("emission", 1.0),
+    )
 
 
 def _note_rest(inputs: _Inputs, names) -> None:

@@ -41,11 +41,8 @@ def cofactors(linear: np.ndarray) -> np.ndarray:
     return -matrix if np.linalg.det(linear) < 0 else matrix
 
 
-def join(surfaces: list[Surface]) -> Surface:
-    """Return several surfaces of one material as one.
-
-    They must have the same arrays (normals, texture coordinates, colors), or none.
-    """
+def join(surfaces: list[Surface], material) -> Surface:
+    """Return several surfaces of one material as one; ``kind_of`` is the same for all of them."""
     if len(surfaces) == 1:
         return surfaces[0]
     sizes = [len(surface.positions) for surface in surfaces]
@@ -56,11 +53,15 @@ def join(surfaces: list[Surface]) -> Surface:
             return None
         return np.concatenate([getattr(surface, name) for surface in surfaces])
 
+    uv = [chosen_uv(surface, material) for surface in surfaces]
+    uv = None if uv[0] is None else np.concatenate(uv)
+    named = all(material.uv_primvar in surface.uv_sets for surface in surfaces)
     return replace(
         surfaces[0],
         faces=np.concatenate([s.faces + begin for s, begin in zip(surfaces, begins)]),
-        uv_sets={},
-        **{name: rows(name) for name in ("positions", "normals", "uv", "colors", "opacity")},
+        uv=uv,
+        uv_sets={material.uv_primvar: uv} if named else {},
+        **{name: rows(name) for name in ("positions", "normals", "colors", "opacity")},
         face_of=None,
     )
 

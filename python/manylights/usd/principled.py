@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manylights.usd.shading import Attribute, Lookup
+from manylights.usd.shading import LUMINANCE, Attribute, Lookup, like
 from manylights.usd.textures import Textures
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass
@@ -111,9 +109,9 @@ class Principled:
         if look.emission_weight <= 0:
             return None
         radiance = self._color(look.emission, look.emission_weight, "emission")
-        if radiance["type"] == "rgb" and not np.any(radiance["value"]):
-            return None
-        return radiance
+        image = radiance.get("nested", radiance).get("bitmap")
+        values = radiance.get("value", (1.0,)) if image is None else np.array(image)
+        return radiance if np.any(values) else None
 
     def _set_reflectance(self, bsdf: dict, look: Look) -> None:
         if look.specular_color is None:
@@ -128,12 +126,12 @@ class Principled:
         if isinstance(part, Lookup):
             if weight != 1:
                 part.scale, part.bias = part.scale * weight, part.bias * weight
-            part, weight = self.textures.make(part, role), 1.0
+            part = self.textures.make(part, role)
         elif isinstance(part, Attribute):
             part = self._attribute(part, "colors", "color")
         if isinstance(part, dict):
             return part
-        three = np.broadcast_to(np.nan_to_num(np.array(part, dtype=float))[..., :3], 3) * weight
+        three = np.broadcast_to(np.array(part, dtype=float), 3) * weight
         limits = (0, 1) if role == "color" else (0, None)
         return {"type": "rgb", "value": [float(value) for value in np.clip(three, *limits)]}
 
@@ -145,8 +143,7 @@ class Principled:
             part = self._attribute(part, "opacity", "opacity")
         if isinstance(part, dict):
             return part
-        value = np.array(part, dtype=float)
-        return float(np.clip(np.nan_to_num(value @ LUMINANCE if value.ndim else value), 0, 1))
+        return float(np.clip(part, 0, 1))
 
     def _attribute(self, part: Attribute, rows: str, name: str):
         """Return the colors of the mesh, the fallback if it has none."""
@@ -157,7 +154,9 @@ class Principled:
         text = f"the primvar {part.primvar} is not read here, its fallback value is used"
         self.context.notes.add("primvar reader", text, self.prim)
         fallback = (0.0, 0.0, 0.0) if rows == "colors" else 1.0
-        return fallback if part.fallback is None else part.fallback
+        if part.fallback is None:
+            return fallback
+        return like(part.fallback, fallback, self.prim, self.context)
 
     def _gloss(self, roughness):
         """Return Disney's gloss for which alpha is the square of the coat's roughness."""

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Sdf, UsdShade
 
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
 DEEPEST = 32
 """Nodes in a row; networks may have circles."""
 
@@ -97,6 +99,41 @@ def constant(shader, name: str, context, fallback=None):
     return context.value(attribute, fallback)
 
 
+def like(value, fallback, prim, context):
+    """Return a value as a number, or as many as the fallback has; the fallback if it is none.
+
+    Three numbers become one by their luminance, one becomes several.
+    """
+    size = np.size(fallback)
+    try:
+        array = np.atleast_1d(np.array(value, dtype=np.float64))
+        if size == 1 and array.shape in ((3,), (4,)):
+            array = array[:3] @ LUMINANCE
+        array = np.broadcast_to(array if array.size == 1 else array[:size], size)
+        if not np.isfinite(array).all():
+            raise ValueError("not finite")
+    except (TypeError, ValueError):
+        shown = " ".join(str(value).split())[:60]
+        text = f"an input of a shader has the value {shown}: its fallback is used"
+        context.notes.add("shader input", text, prim)
+        return fallback
+    return tuple(array.tolist()) if np.ndim(fallback) else float(array.item())
+
+
+def constant_like(shader, name: str, context, fallback):
+    """Return the value of an input, ``like`` its fallback."""
+    value = constant(shader, name, context)
+    return fallback if value is None else like(value, fallback, shader, context)
+
+
+def evaluate_like(shader, name: str, context, fallback):
+    """Return what feeds an input, a value ``like`` the fallback; the fallback if nothing does."""
+    found = evaluate(shader.GetInput(name), context)
+    if found is None or isinstance(found, (Lookup, Attribute)):
+        return fallback if found is None else found
+    return like(found, fallback, shader, context)
+
+
 def evaluate(shader_input, context, depth: int = 0):
     """Return what feeds an input: a value, a ``Lookup``, an ``Attribute``, or ``None``."""
     if not shader_input:
@@ -129,9 +166,8 @@ def evaluate_node(shader, output, context, depth: int):
 def _uv_texture(shader, channel: str, context) -> Lookup:
     lookup = Lookup(shader.GetInput("file"), shader, channel if channel in "rgba" else "rgb")
     for name in ("scale", "bias", "fallback"):
-        value = constant(shader, name, context)
-        if value is not None:
-            setattr(lookup, name, np.array(value, dtype=np.float64))
+        value = constant_like(shader, name, context, tuple(getattr(lookup, name)))
+        setattr(lookup, name, np.array(value))
     wraps = [constant(shader, name, context, "useMetadata") for name in ("wrapS", "wrapT")]
     lookup.wrap = tuple(str(wrap) for wrap in wraps)
     space = constant(shader, "sourceColorSpace", context, "auto")
@@ -184,9 +220,9 @@ def texture_coordinate(shader_input, context) -> tuple[str | None, np.ndarray]:
 
 def transform_2d(shader, context) -> np.ndarray:
     """Return the matrix of a UsdTransform2d: scale, then rotation (degrees), then translation."""
-    scale = constant(shader, "scale", context, (1, 1))
-    angle = np.radians(constant(shader, "rotation", context, 0.0))
-    shift = constant(shader, "translation", context, (0, 0))
+    scale = constant_like(shader, "scale", context, (1, 1))
+    angle = np.radians(constant_like(shader, "rotation", context, 0.0))
+    shift = constant_like(shader, "translation", context, (0, 0))
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.array([[cos, -sin, shift[0]], [sin, cos, shift[1]], [0, 0, 1]])
     return turn @ np.diag([scale[0], scale[1], 1.0])
@@ -194,14 +230,19 @@ def transform_2d(shader, context) -> np.ndarray:
 
 def _place_2d(shader, context) -> np.ndarray:
     """Return the matrix of MaterialX's place2d, which divides by its scale, about a pivot."""
-    scale = np.array(constant(shader, "scale", context, (1, 1)), dtype=float)
-    angle = np.radians(constant(shader, "rotate", context, 0.0))
-    offset = np.array(constant(shader, "offset", context, (0, 0)), dtype=float)
-    pivot = np.array(constant(shader, "pivot", context, (0, 0)), dtype=float)
+    scale = np.array(constant_like(shader, "scale", context, (1, 1)))
+    angle = np.radians(constant_like(shader, "rotate", context, 0.0))
+    offset = np.array(constant_like(shader, "offset", context, (0, 0)))
+    pivot = np.array(constant_like(shader, "pivot", context, (0, 0)))
     cos, sin = np.cos(-angle), np.sin(-angle)
 
     def moved(by):
         return np.array([[1, 0, by[0]], [0, 1, by[1]], [0, 0, 1]])
 
     turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-    return moved(pivot - offset) @ turn @ np.diag([*(1 / scale), 1.0]) @ moved(-pivot)
+    return (
+        moved(pivot - offset)
+        @ turn
+        @ np.diag([*(1 / np.where(scale == 0, 1, scale)), 1.0])
+        @ moved(-pivot)
+    )

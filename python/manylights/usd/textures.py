@@ -23,7 +23,7 @@ FLIP = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 """From texture coordinates of USD (origin at the bottom) to Mitsuba's, and back."""
 
 #: What values of a texture may be, by what it is for: ``None`` means that there is no limit
-LIMITS = {"color": (0, 1), "data": (0, 1), "emission": (0, None), "normal": (None, None)}
+LIMITS = {"color": (0, 1), "data": (0, 1), "emission": (0, None)}
 
 
 def to_mitsuba_uv(uv: np.ndarray) -> np.ndarray:
@@ -81,9 +81,8 @@ class Textures:
             image, gamma = pixels[..., "rgba".index(channel), None], False
         else:
             values = decode(pixels, encoding) * lookup.scale + lookup.bias
-            image = (
-                values[..., :3] if channel == "rgb" else values[..., "rgba".index(channel), None]
-            )
+            chosen = slice(3) if channel == "rgb" else ["rgba".index(channel)]
+            image = values[..., chosen]
             image = (image + 1) / 2 if role == "normal" else np.clip(image, *LIMITS[role])
             image = image >= lookup.threshold if lookup.threshold > 0 else image
             # Half precision holds what 8 bits or a half were
