@@ -297,3 +297,30 @@ def test_without_usd_core_the_error_says_what_to_install(usd):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "pip install 'manylights[usd]'" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    "options, text",
+    [
+        ({"purposes": ("default", "preview")}, "purpose 'preview'.*proxy"),
+        ({"subdivision": -1}, "subdivision -1"),
+        ({"subdivision": 50}, "subdivision 50"),
+    ],
+)
+def test_options_out_of_range(usd, tmp_path, options, text):
+    with pytest.raises(ValueError, match=text):
+        usd.load(write_stage(tmp_path, LIT), **options)
+
+
+def test_many_missing_pictures_share_notes(usd, tmp_path):
+    file = "asset inputs:texture:file"
+    text = ";".join(f'def RectLight "l_{i}" {{;{file} = @./p_{i}.exr@;}}' for i in range(50))
+    scene = usd.load(write_stage(tmp_path, text))
+    found = [entry for entry in scene.notes if "p_" in entry.text]
+    assert len(found) == 5 and sum(entry.count for entry in found) == 50
+
+
+def test_the_reader_is_an_attribute_of_the_package(plugin):
+    assert plugin.usd.load
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = plugin.nothing

@@ -11,8 +11,14 @@ from manylights.usd.description import instantiate
 from manylights.usd.drawing import Drawing
 from manylights.usd.lights import Lights
 from manylights.usd.settings import Settings
-from manylights.usd.stage import guarded, open_stage, time_of
+from manylights.usd.stage import StageError, guarded, open_stage, time_of
 from manylights.usd.traversal import collect
+
+#: What prims of a stage may be for.
+PURPOSES = ("default", "render", "proxy", "guide")
+
+#: Each level has four times as many faces: more fill the memory.
+MOST_SUBDIVISION = 8
 
 
 class SceneDict(dict):
@@ -98,6 +104,9 @@ def describe(
     blender_light_units=False,
 ) -> SceneDict:
     """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet."""
+    purposes = _purposes(purposes)
+    if subdivision is not None and not 0 <= subdivision <= MOST_SUBDIVISION:
+        raise StageError(f"subdivision {subdivision}: 0 to {MOST_SUBDIVISION} levels are possible")
     notes = Notes()
     with guarded(path):
         stage = open_stage(path, notes)
@@ -105,13 +114,21 @@ def describe(
             stage=stage,
             time=time_of(stage, time),
             notes=notes,
-            purposes=tuple(purposes),
+            purposes=purposes,
             subdivision=subdivision,
             legacy_lights=legacy_lights,
             blender_light_units=blender_light_units,
         )
         skinning.bake(context)
         return _read(context, camera, default_light)
+
+
+def _purposes(purposes) -> tuple[str, ...]:
+    purposes = (purposes,) if isinstance(purposes, str) else tuple(purposes)
+    for purpose in purposes:
+        if purpose not in PURPOSES:
+            raise StageError(f"purpose {purpose!r}: it has to be one of {', '.join(PURPOSES)}")
+    return purposes
 
 
 def _read(context: Context, camera, default_light: bool) -> SceneDict:
