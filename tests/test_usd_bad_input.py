@@ -177,6 +177,31 @@ def test_instancers_that_instance_each_other(usd, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        'def PointInstancer "bad" {;int protoIndices = 3;point3f[] positions = [(0, 0, 0)];}',
+        'def PointInstancer "bad" {;int[] protoIndices = [0];string positions = "here";}',
+        'def Xform "bad" {;int visibility = 3;double3 xformOp:translate = (0, 0, 0);'
+        'uniform token[] xformOpOrder = ["xformOp:nothing"];}',
+        'def Mesh "bad" {;string points = "none";int faceVertexCounts = 3;}',
+        'def Camera "bad" {;string focalLength = "long";}',
+        'def Camera "bad" {;string clippingRange = "near";token projection = "none";}',
+        'def RenderSettings "bad" {;string resolution = "high";int camera = 1;}',
+        'def RenderSettings "bad" {;string mitsuba:sample_count = "many";}',
+    ],
+)
+def test_attributes_of_another_type(usd, tmp_path, text):
+    """They are noted, ignored, or an error: never another exception."""
+    path = write_stage(tmp_path, LIT + text)
+    try:
+        scene = usd.load(path)
+    except usd.StageError as error:
+        assert "/bad" in str(error)
+        return
+    mi.load_dict(scene)
+
+
+@pytest.mark.parametrize(
     "matrix",
     ["(nan, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)", "(inf, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)"],
 )
@@ -184,7 +209,7 @@ def test_transforms_that_are_not_finite(usd, tmp_path, matrix):
     order = 'uniform token[] xformOpOrder = ["xformOp:transform"];'
     place = f"matrix4d xformOp:transform = ({matrix}, (0, 0, 0, 1));{order}"
     scene = usd.load(write_stage(tmp_path, f'def Xform "a" {{;{place}{LIT}}}'))
-    assert "/a" in note(scene, "transform")
+    assert "/a" in note(scene, "prim") and "not finite" in note(scene, "prim")
 
 
 @pytest.mark.parametrize("kind", ["SphereLight", "RectLight", "DiskLight", "CylinderLight"])

@@ -48,7 +48,7 @@ class Drawing:
                 continue
             try:
                 quiet += self._add_shining(batch, item)
-            except (Tf.ErrorException, ValueError) as error:
+            except (Tf.ErrorException, TypeError, ValueError) as error:
                 reason = " ".join(str(error).split())
                 text = f"a geometry could not be read: {reason}"
                 self.context.notes.add("geometry", text, item.prim)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from manylights.errors import one_line
 from manylights.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
 from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
@@ -150,14 +151,7 @@ def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_l
     lights.finish(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0)
     settings = Settings(context)
     scene = SceneDict(type="scene")
-    prim = cameras.choose_camera(context, camera, settings)
-    scene.exposure, scene.camera = 1.0, None
-    if prim is None:
-        shown = geometry if len(geometry) else points
-        scene["sensor"] = cameras.framing_sensor(context, shown, settings)
-    else:
-        scene["sensor"], scene.exposure = cameras.sensor_of(prim, context, settings)
-        scene.camera = str(prim.GetPath())
+    _add_sensor(scene, context, settings, camera, geometry if len(geometry) else points)
     scene.update(lights.entries)
     meshes = lights.lamps.meshes()
     scene.update({f"lamps_{index}": mesh for index, mesh in enumerate(meshes)})
@@ -170,6 +164,22 @@ def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_l
     scene.notes = context.notes
     scene.metadata = _metadata(context)
     return scene
+
+
+def _add_sensor(scene: SceneDict, context: Context, settings: Settings, camera, points) -> None:
+    prim = cameras.choose_camera(context, camera, settings)
+    scene.exposure, scene.camera = 1.0, None if prim is None else str(prim.GetPath())
+    try:
+        if prim is None:
+            scene["sensor"] = cameras.framing_sensor(context, points, settings)
+        else:
+            scene["sensor"], scene.exposure = cameras.sensor_of(prim, context, settings)
+    except StageError:
+        raise
+    except (TypeError, ValueError) as error:
+        places = [str(part.GetPath()) for part in (prim, settings.prim) if part]
+        text = f"{' or '.join(places)}: an attribute of the wrong type: {one_line(error)}"
+        raise StageError(text) from None
 
 
 def _integrator(context: Context, settings: Settings, uses_attribute: bool) -> dict:

@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdLux
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
+from manylights.errors import one_line
 from manylights.usd.context import Context
 
 #: More copies than this of one prototype do not fit into memory.
@@ -123,7 +124,12 @@ class _Traversal:
         stack = [(root, state)]
         while stack:
             prim, state = stack.pop()
-            below = self._visit(prim, state, batch, prim == root)
+            try:
+                below = self._visit(prim, state, batch, prim == root)
+            except (TypeError, ValueError, Tf.ErrorException) as error:
+                text = f"a prim and all below it was left out: {one_line(error)}"
+                self.context.notes.add("prim", text, prim)
+                continue
             if below is not None:
                 children = prim.GetFilteredChildren(predicate)
                 stack.extend((child, below) for child in reversed(children))
@@ -139,12 +145,7 @@ class _Traversal:
         imageable = UsdGeom.Imageable(prim)
         if self.context.value(imageable.GetVisibilityAttr()) == UsdGeom.Tokens.invisible:
             return None
-        try:
-            state = self._enter(prim, imageable, state, is_root)
-        except ValueError as error:
-            text = f"a prim and all below it was left out: {error}"
-            self.context.notes.add("transform", text, prim)
-            return None
+        state = self._enter(prim, imageable, state, is_root)
         if prim.IsInstance() and not is_root:
             key = (prim.GetPrototype().GetPath(), state.purpose, self._inheritance(prim))
             self._native.setdefault(key, []).append((prim, state))
