@@ -349,3 +349,11 @@ def test_the_reader_is_an_attribute_of_the_package(plugin):
     assert plugin.usd.load
     with pytest.raises(AttributeError, match="nothing"):
         _ = plugin.nothing
+
+
+def test_foreign_types_are_noted(usd, tmp_path):
+    text = 'def Gizmo "a" {;def SphereLight "light" {;}};def Gizmo "b" {;};def PhysicsScene "c" {;}'
+    scene = usd.load(write_stage(tmp_path, text))
+    (found,) = (entry for entry in scene.notes if entry.kind.startswith("type"))
+    assert (found.kind, found.count, found.prim) == ("type Gizmo", 2, "/a")
+    assert len(mi.load_dict(scene).emitters()) == 1

@@ -140,8 +140,11 @@ class _Traversal:
         if prim.IsPseudoRoot():
             return state
         role = self._role(prim)
-        if role in ("untyped", "looked up"):
-            return state if role == "untyped" else None
+        if role == "foreign":
+            text = f"prims of the foreign type {prim.GetTypeName()} are left out"
+            self.context.notes.add(f"type {prim.GetTypeName()}", text, prim)
+        if role in ("untyped", "foreign", "looked up"):
+            return None if role == "looked up" else state
         imageable = UsdGeom.Imageable(prim)
         if self.context.value(imageable.GetVisibilityAttr()) == UsdGeom.Tokens.invisible:
             return None
@@ -297,5 +300,6 @@ def _role_of(prim: Usd.Prim) -> str:
     if prim.HasAPI(UsdLux.LightAPI):
         return "light"
     if not prim.IsA(UsdGeom.Imageable):
-        return "untyped"
+        known = not name or Usd.SchemaRegistry.IsConcrete(name)
+        return "untyped" if known else "foreign"
     return "container" if name in CONTAINERS else "unknown"
