@@ -657,3 +657,29 @@ def test_units_of_length_change_nothing(load, unit):
     assert (part["radius"], part["center"]) == (0.5, [0, 0, 5])
     assert color(part["emitter"]["radiance"]) == pytest.approx([1] * 3)
     assert scene.metadata["metersPerUnit"] == pytest.approx(unit)
+
+
+def test_connected_inputs(load):
+    """An input may get its value from that of a node graph; a shader's result is noted."""
+    graph = """def NodeGraph "dimmer" { ; float inputs:level = 9; };
+        def Shader "noise" { ; uniform token info:id = "noise"; color3f outputs:rgb; };"""
+    light = "float inputs:intensity.connect = </dimmer.inputs:level>;"
+    light += (
+        "color3f inputs:color = (1, 0.5, 0);color3f inputs:color.connect = </noise.outputs:rgb>;"
+    )
+    scene = load(f'{graph};def SphereLight "a" {{;{light}}}')
+    (part,) = emitters(scene, "sphere")
+    assert color(part["emitter"]["radiance"]) == pytest.approx([9, 4.5, 0])
+    assert "inputs:color" in note(scene, "connection")
+
+
+@pytest.mark.parametrize("kind, z", [("RectLight", 2.0), ("DiskLight", 2.0), ("SphereLight", 5.0)])
+def test_cone_from_near(load, kind, z):
+    """Spots stand for a light to a few percent, also near its soft edge."""
+    matrix = row_matrix(np.eye(3), (0.25 * z, 0.2 * z, z))
+    scene = load(f'def {kind} "a" {{;{cone(40, 0.8)}{matrix_op(matrix)}}}')
+    points, normals = SURFACES[kind](matrix)
+    theta = np.arccos(points[:, 2] / np.linalg.norm(points, axis=1))
+    x = np.clip((theta - np.radians(8)) / np.radians(32), 0, 1)
+    shaped = points, normals * (1 - x * x * (3 - 2 * x))[:, None]
+    assert_irradiance(scene, seen(shaped), rounding=0.025, spp=4, seeds=range(2))
