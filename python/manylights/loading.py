@@ -141,15 +141,19 @@ def _check_images(files: list[Path]) -> None:
 
 
 class search_beside:
-    """Context in which Mitsuba looks for a scene's files in the folder of ``path`` first."""
+    """Context in which Mitsuba looks for a scene's files in the folder of ``path`` first.
+
+    If ``path`` is a symbolic link, its own folder comes before that of the file it leads to.
+    """
 
     def __init__(self, path: str) -> None:
-        self.folder = str(Path(path).resolve().parent)
+        self.folders = [Path(path).absolute().parent, Path(path).resolve().parent]
 
     def __enter__(self) -> None:
         self.before = mi.file_resolver()
         resolver = type(self.before)(self.before)
-        resolver.prepend(self.folder)
+        for folder in reversed(self.folders):
+            resolver.prepend(str(folder))
         mi.set_file_resolver(resolver)
 
     def __exit__(self, *_) -> None:

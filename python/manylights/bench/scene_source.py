@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import os
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -106,7 +107,7 @@ def _file(path: str, defines: dict[str, str]) -> Source:
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
-    folder, file_name = Path(path).resolve().parts[-2:]
+    folder, file_name = Path(os.path.abspath(path)).parts[-2:]
     text = f"{folder}/{file_name}"
     digest = hashlib.sha256(json.dumps(defines, sort_keys=True).encode())
     for file in files:
