@@ -22,8 +22,9 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
         DRJIT_STRUCT(State, pi, passed, active)
     };
     State state{ pi, Float(0.f), active };
-    auto on_emitter = [](const State &s) { // scalar shapes may be null
-        return s.active && s.pi.is_valid() && s.pi.shape->emitter() != nullptr;
+    auto on_emitter = [](const State &s) { // instances have no shape yet
+        return s.active && s.pi.is_valid() && s.pi.shape != nullptr &&
+               s.pi.shape->emitter() != nullptr;
     };
     loop(
         state, on_emitter,
