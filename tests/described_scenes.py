@@ -377,7 +377,8 @@ def load_patch(scene):
         if (low < eye).all() and (eye < high).all():
             sensor["medium"] = reference
     for index, light in enumerate(scene["lights"]):
-        result[f"light_{index}"] = light_object(light, f"light_{index}")
+        name = f"light_{index}"
+        result[name] = light_object(brighter(light, scene["power"]), name)
     return mi.load_dict(result)
 
 

@@ -392,7 +392,7 @@ def image(scene, seed, side=20):
         light_in = light_in * transmittance(fog, at, at + begin * (eye - at))
         shape = (PATCH_PIXELS, divisions, PATCH_PIXELS, divisions, 3)
         total = total + light_in.reshape(shape).mean(axis=(1, 3))
-    return np.array(scene["albedo"]) / np.pi * total
+    return scene["power"] * np.array(scene["albedo"]) / np.pi * total
 
 
 def images(scene, seeds, side=20):

@@ -212,7 +212,6 @@ PLAIN = {
     "medium": None,
     "instances": None,
     "power": 1.0,
-    "unit": 1.0,
     "crop": False,
     "kind": "perspective",
     "sampler": "independent",
