@@ -10,18 +10,16 @@ from scipy import stats
 from tests import statistics_tools as tools
 
 
-def for_examples(check, strategy, count, shrink=False):
-    """Call `check` with `count` examples, the same ones in every run.
+def for_examples(check, strategy, count):
+    """Call `check` with `count` examples, the same ones in every run."""
 
-    Where one fails Hypothesis prints it; with `shrink` it looks for a smaller one first.
-    """
-
+    # Which ones they are follows from the text of this function, decorators included
     @settings(
         max_examples=count,
         derandomize=True,
         deadline=None,
         database=None,
-        phases=[Phase.generate, Phase.shrink] if shrink else [Phase.generate],
+        phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
     @given(strategy)
@@ -29,6 +27,19 @@ def for_examples(check, strategy, count, shrink=False):
         check(example)
 
     run()
+
+
+def for_examples_and_smaller(check, strategy, count):
+    """The same, but where one fails Hypothesis looks for a smaller one, and prints that."""
+    chosen = settings(
+        max_examples=count,
+        derandomize=True,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate, Phase.shrink],
+        suppress_health_check=list(HealthCheck),
+    )
+    chosen(given(strategy)(check))()
 
 
 def quick_and_slow(quick, slow):

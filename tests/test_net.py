@@ -21,7 +21,7 @@ from tests import described_scenes, light_quadrature, scene_strategies
 from tests.example_tools import (
     SEEDS,
     compare_in_scenes,
-    for_examples,
+    for_examples_and_smaller,
     images,
     quick_and_slow,
 )
@@ -71,7 +71,7 @@ def test_any_scene_renders(variant, examples):
 
         jit = "scalar" not in variant
         drawn = strategy(any_scene, spectral=mi.is_spectral, jit=jit)
-        for_examples(renders, drawn, examples, shrink=True)
+        for_examples_and_smaller(renders, drawn, examples)
 
 
 def test_seeded_descriptions_are_those_of_the_soak():
