@@ -90,6 +90,21 @@ def test_instances_in_scalar_variant(scalar, hide_emitters):
         assert not check(scene | {"integrator": integrator})
 
 
+def test_hidden_emitter_is_passed_along_its_surface(scalar):
+    """A ray along the wall of a hidden cylinder found it again and again: no end."""
+    scene = any_scene(Seeded(0)) | {"instances": None, "medium": None, "environment": None}
+    place = [["translate", [0.375, -1.406, 1.047]], ["rotate", [0.75, 0.3438, 1.0], -16.88]]
+    place += [["scale", [0.1331, 0.1331, 0.21]]]
+    cylinder = {"kind": "cylinder", "flip": False, "surface": "twosided"}
+    cylinder["radiance"] = {"kind": "uniform", "value": 1.0}
+    scene |= {"floor": "diffuse", "ball": "diffuse"}
+    camera = {"kind": "perspective", "crop": False, "sampler": "orthogonal", "spp": 9}
+    scene |= {"lights": [cylinder | {"steps": place}], "camera": camera, "power": 1.0}
+    scene |= {"integrator": {"type": "manylights_direct", "hide_emitters": True}}
+    with Children("scalar_rgb", LIMIT) as children:
+        assert not children.ask(scene)
+
+
 # ------------------------------------------------------------------------------------ quadrature
 
 

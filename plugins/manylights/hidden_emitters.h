@@ -26,6 +26,9 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
         return s.active && s.pi.is_valid() && s.pi.shape != nullptr &&
                s.pi.shape->emitter() != nullptr;
     };
+    auto epsilon = [](const auto &p) { // that of Mitsuba's rays
+        return (1.f + dr::max(dr::abs(p))) * mitsuba::math::RayEpsilon<Float>;
+    };
     loop(
         state, on_emitter,
         [&](State &s) {
@@ -34,8 +37,12 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
             auto si = s.pi.compute_surface_interaction(rest, +mitsuba::RayFlags::Minimal,
                                                        s.active);
             Ray3f next = si.spawn_ray(ray.d);
-            s.passed   = dr::dot(next.o - ray.o, ray.d);
-            s.pi       = scene->ray_intersect_preliminary(next, true, s.active);
+            // Along a surface the offset from it does not get ahead, and it is met for ever
+            Float least = s.passed + s.pi.t + epsilon(si.p),
+                  ahead = dr::dot(next.o - ray.o, ray.d);
+            s.passed    = dr::maximum(least, ahead);
+            next.o += ray.d * (s.passed - ahead);
+            s.pi = scene->ray_intersect_preliminary(next, true, s.active);
         },
         "Hidden emitters");
     pi = state.pi;
