@@ -116,7 +116,7 @@ def radiance_dict(value):
     if kind in ("vertex_color", "face_color"):
         return {"type": "mesh_attribute", "name": kind, "scale": value["scale"]}
     if kind == "blackbody":
-        return {"type": kind, "temperature": value["temperature"], "scale": value["scale"]}
+        return {"type": kind, "temperature": value["temperature"]}
     middle, width, scale = value["middle"], value["width"], value["scale"]
     if kind == "regular":
         return regular(middle, width, scale)
@@ -474,7 +474,7 @@ def brighter(light, power):
             emitted["scale"] *= power
         elif emitted["kind"] == "rgb":
             emitted["value"] = [power * value for value in emitted["value"]]
-        else:
+        elif emitted["kind"] == "uniform":
             emitted["value"] *= power
         light["radiance"] = emitted
     return light

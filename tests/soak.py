@@ -72,14 +72,19 @@ def answer(description):
         return f"{type(cause).__name__}: {str(cause).strip().splitlines()[-1]}"
 
 
-def described(seed):
-    """The description of a number, in the current variant."""
+def variant_arguments():
+    """What `any_scene` may draw in the current variant."""
     import mitsuba as mi
 
+    jit = "scalar" not in mi.variant()
+    return {"spectral": mi.is_spectral, "jit": jit, "sun": not mi.is_monochromatic}
+
+
+def described(seed):
+    """The description of a number, in the current variant."""
     from tests.scene_strategies import Seeded, any_scene
 
-    jit = "scalar" not in mi.variant()
-    return any_scene(Seeded(seed), spectral=mi.is_spectral, jit=jit)
+    return any_scene(Seeded(seed), **variant_arguments())
 
 
 def work(variant):

@@ -26,7 +26,7 @@ from tests.example_tools import (
     quick_and_slow,
 )
 from tests.scene_strategies import FOGS, Seeded, any_scene, lit_patch, strategy, wide_lamps
-from tests.soak import Children, check
+from tests.soak import Children, check, variant_arguments
 
 pytestmark = pytest.mark.usefixtures("plugin")
 
@@ -69,8 +69,7 @@ def test_any_scene_renders(variant, examples):
             text = children.ask(description)
             assert not text, text
 
-        jit = "scalar" not in variant
-        drawn = strategy(any_scene, spectral=mi.is_spectral, jit=jit)
+        drawn = strategy(any_scene, **variant_arguments())
         for_examples_and_smaller(renders, drawn, examples)
 
 
