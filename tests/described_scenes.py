@@ -281,7 +281,7 @@ def fog_grid(values, low, high, name="sigma_t"):
         "type": "gridvolume",
         "grid": mi.VolumeGrid(values.astype(np.float32)),
         "to_world": transform().translate(np.array(low).tolist()).scale(size),
-        "raw": True,
+        "raw": values.shape[-1] == 1 or not mi.is_spectral,
     }
 
 
