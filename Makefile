@@ -41,6 +41,11 @@ test: $(INSTALLED)  ## Run the quick tests
 test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
+# Other seeds and variants: make soak ARGS="2000 --seed 50000 --variant llvm_ad_rgb"
+.PHONY: soak
+soak: $(INSTALLED)  ## Render 10,000 random scenes in child processes: no crash, no hang, no NaN
+	$(BIN)/python -m tests.soak $(ARGS)
+
 # Another build, beside the usual one. What it finds ends the process, so that its report must
 # not be kept by pytest; memory is not given back at once and cannot be watched. Tests of means
 # are left out: they render the scenes that test_robust.py renders, hundreds of times.

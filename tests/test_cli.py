@@ -492,6 +492,37 @@ def fail_to_render(capsys, scene):
     return capsys.readouterr().err.splitlines()[-1]
 
 
+def linked(tmp_path, beside):
+    """A link to a scene file among blobs, as caches keep them, and a file in one of the folders."""
+    blobs, snapshot = tmp_path / "blobs", tmp_path / "snapshot"
+    blobs.mkdir()
+    snapshot.mkdir()
+    referring(blobs, "bulbs.ply").rename(blobs / "1b9a")
+    (blobs / "7c30").write_bytes((SCENES / "data" / "bulbs.ply").read_bytes())
+    path = snapshot / "scene.xml"
+    path.symlink_to("../blobs/1b9a")
+    (tmp_path / beside / "bulbs.ply").symlink_to(blobs / "7c30")
+    return path
+
+
+@pytest.mark.parametrize("beside", ["snapshot", "blobs"])
+@pytest.mark.parametrize("relative", [False, True])
+def test_files_are_found_beside_a_link(scalar, tmp_path, monkeypatch, beside, relative):
+    """Beside the path that was given, else beside the file that it leads to."""
+    path = linked(tmp_path, beside)
+    if relative:
+        monkeypatch.chdir(path.parent)
+    files = loading.load(path.name if relative else str(path)).files
+    assert [file.name for file in files] == ["scene.xml", "bulbs.ply"]
+    assert files[1].parent == tmp_path / beside
+
+
+def test_files_beside_a_link_come_before_those_beside_the_scene(scalar, tmp_path):
+    path = linked(tmp_path, "snapshot")
+    (tmp_path / "blobs" / "bulbs.ply").write_text("not the one")
+    assert loading.load(str(path)).files[1].parent == path.parent
+
+
 @pytest.mark.parametrize("name", REFERENCES)
 def test_missing_file_of_a_scene_is_named(capsys, tmp_path, name):
     line = fail_to_render(capsys, referring(tmp_path, name))

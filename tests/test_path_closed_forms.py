@@ -186,6 +186,92 @@ def test_plane_in_absorbing_fog(variant):
     assert_exact(images, exact, tile=1, label=f"plane in fog, {variant}")
 
 
+# ------------------------------------------------------------------------------------------ masks
+#
+# Mitsuba's area emitters shine whole, whatever the opacity of their surface: the mask lets other
+# light through and takes nothing from the emission. Its `path` and ours agree on that wherever
+# something is behind the lamp. With nothing behind it `path` drops the emission of the samples
+# that pass through the mask (opacity .5: .5 times the radiance), since they end in no surface;
+# ours keeps them, as `direct`, and `volpath` in fog. That a lamp does not change with what is
+# behind it decides for ours.
+
+RADIANCE = (1.0, 2.0, 3.0)
+
+
+def masked(opacity, **shape):
+    """A rectangle under a mask, black where it is opaque."""
+    black = {"type": "diffuse", "reflectance": 0.0}
+    mask = {"type": "mask", "opacity": opacity, "nested": {"type": "twosided", "nested": black}}
+    return {"type": "rectangle", "bsdf": mask, **shape}
+
+
+def lamp(height, opacity, **shape):
+    """An emissive rectangle of side 1 that looks down from this height."""
+    frame = path_scenes.transform().translate([0, 0, height]).rotate([1, 0, 0], 180).scale(0.5)
+    emitter = {"type": "area", "radiance": rgb(RADIANCE)}
+    return masked(opacity, to_world=frame, emitter=emitter, **shape)
+
+
+def look_up(things):
+    """A camera that sees nothing but the lamp two above it, and what is given."""
+    camera = closed_form.Camera((0, 0, 0), (0, 0, 1), (0, 1, 0), 20, 4, 4)
+    scene = closed_form.scene_dict(camera, [], ALBEDO)
+    del scene["plane"]
+    return scene | things
+
+
+@both_variants
+@pytest.mark.parametrize("wall", [False, True], ids=["nothing", "wall"])
+@pytest.mark.parametrize("depth", [1, 3])
+def test_lamp_under_mask_is_seen_whole(variant, depth, wall):
+    """Its emission does not depend on the opacity, nor on what is behind it."""
+    things = {"lamp": lamp(2, 0.5)}
+    if wall:
+        things["wall"] = masked(1.0, to_world=path_scenes.transform().translate([0, 0, 4]).scale(9))
+    assert_exact(images_of(look_up(things), max_depth=depth), RADIANCE)
+
+
+@both_variants
+def test_lamp_under_mask_is_seen_whole_in_fog(variant):
+    """The same through absorbing fog; the camera's near plane is where it begins."""
+    scene = look_up({"lamp": lamp(2, 0.5)})
+    scene["sensor"]["medium"] = homogeneous(EXTINCTION, 0.0)
+    camera = closed_form.Camera((0, 0, 0), (0, 0, 1), (0, 1, 0), 20, 4, 4)
+    exact = closed_form.slab_image(camera, 2 - closed_form.NEAR_CLIP, EXTINCTION, RADIANCE)
+    assert_exact(images_of(scene, max_depth=3), exact)
+
+
+@both_variants
+def test_lamp_behind_mask_in_front_of_nothing(variant):
+    """What is opaque of a mask covers a lamp behind it, and the rest shows it: 1 - opacity."""
+    mask = masked(0.3, to_world=path_scenes.transform().translate([0, 0, 1]).scale(9))
+    exact = 0.7 * np.array(RADIANCE)
+    assert_exact(images_of(look_up({"lamp": lamp(2, 0.5), "mask": mask}), max_depth=3), exact)
+
+
+def light_of_rectangle(camera, height, albedo, side=48):
+    """Image of the plane z = 0 under the lamp: midpoint rule over both."""
+    points = closed_form.plane_points(camera, *closed_form.film_grid(camera, 4))
+    nodes = (np.arange(side) + 0.5) / side - 0.5
+    total = np.zeros(points.shape[:-1])
+    for x in nodes:
+        for y in nodes:
+            distance2 = ((points - (x, y, height)) ** 2).sum(axis=-1)
+            total += height**2 / distance2**2 / side**2
+    radiance = np.array(albedo) / np.pi * np.array(RADIANCE) * total[..., np.newaxis]
+    return closed_form.pixel_means(camera, radiance, 4)
+
+
+@both_variants
+@pytest.mark.parametrize("opacity", [1.0, 0.5])
+def test_light_of_lamp_under_mask(variant, opacity):
+    """A floor gets all of its light, by paths of three segments, too."""
+    camera = closed_form.Camera((0, -1.5, 0.6), (0, 0, 0), (0, 0, 1), 25, 6, 4)
+    scene = closed_form.scene_dict(camera, [], ALBEDO) | {"lamp": lamp(1, opacity)}
+    exact = light_of_rectangle(camera, 1, ALBEDO)
+    assert_exact(images_of(scene, max_depth=3), exact, tile=1)
+
+
 # ---------------------------------------------------------------------------------- one scattering
 
 FLAKES = (0.15, 0.35, 0.9, 0.05, 0.1, -0.1)

@@ -14,11 +14,9 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
-from tests import statistics_tools as tools
+from tests.example_tools import compare_in_scenes, for_examples, images, quick_and_slow
 from tests.light_scenes import area, make_mesh, rgb, stripes, transform
 from tests.references import set_power_weights
 
@@ -35,31 +33,6 @@ STORED = 2.0**-8
 """Relative rounding of variances and shares of the flux in the wide nodes."""
 
 NONE, LEAF = 0xFFFFFFFF, 0x80000000
-
-
-def for_examples(check, strategy, count):
-    """Call `check` with `count` examples, the same ones in every run."""
-
-    @settings(
-        max_examples=count,
-        derandomize=True,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(strategy)
-    def run(example):
-        check(example)
-
-    run()
-
-
-def quick_and_slow(quick, slow):
-    """Numbers of examples of a quick test, and of its slow twin."""
-    return pytest.mark.parametrize(
-        "examples", [quick, pytest.param(slow, marks=pytest.mark.slow)], ids=["quick", "slow"]
-    )
 
 
 seeds = st.integers(0, 2**31 - 1000)
@@ -644,25 +617,6 @@ def test_unit_of_power_in_any_scene(scalar, examples):
     for_examples(check_unit_of_power, strategy, examples)
 
 
-SEEDS = 16
-"""Renderings of each estimate."""
-
-ERROR = 4.5e-3
-"""Relative standard error of an image mean that the number of samples is chosen for."""
-
-
-def images(loaded, integrator, first_seed):
-    """Renderings (seeds, height, width, channels), with as many samples as their error needs.
-
-    Each scene has seeds of its own: with equal ones, free flights through fog are the same in all
-    scenes, and so are the errors of their means.
-    """
-    pilot = tools.render_seeds(loaded, integrator, 64, range(first_seed, first_seed + 8))
-    spp = tools.samples_for_precision(pilot, 64, SEEDS, ERROR, largest=1 << 13)
-    seeds = range(first_seed + 100, first_seed + 100 + SEEDS)
-    return tools.render_seeds(loaded, integrator, max(64, spp), seeds)
-
-
 def reference_images(scene):
     """The same by Mitsuba, with emitters chosen by power."""
     loaded = scene.load()
@@ -670,53 +624,6 @@ def reference_images(scene):
         set_power_weights(loaded, samples=16)
     kind = {"type": "volpath", "max_depth": 2} if scene.fog else {"type": "direct"}
     return images(loaded, mi.load_dict(kind), 2**31 + scene.seed)
-
-
-def assert_equal_in_scenes(estimates):
-    """Two estimates in each of some scenes: they differ in no scene, nor on average.
-
-    Of `tools.SIGNIFICANCE` one half is divided among the scenes, the other is for the average of
-    the relative differences. The whole family thereby has one false alarm in 100,000 runs, and the
-    average finds a bias of 2 % that no scene shows alone. Scenes are not weighted by the precision
-    that they were found to have: it is higher where rare bright samples have not come.
-    """
-    differences = []
-    for ours, expected, scene in estimates:
-        tools.assert_finite(ours)
-        assert (ours >= 0).all()
-        if not expected.any():
-            assert not ours.any(), scene
-            continue
-        share = tools.SIGNIFICANCE / 2 / len(estimates)
-        comparison = tools.compare_means(ours, expected, share, tile=1)
-        assert comparison.passes, comparison.message(str(scene))
-        means = [estimate.mean(axis=(1, 2, 3)) for estimate in (ours, expected)]
-        test = tools.welch(*means)
-        relative = (test.mean_a - test.mean_b, test.error)
-        differences.append((*(value / test.mean_b for value in relative), test.dof))
-    assert_zero_on_average(*map(np.array, zip(*differences)))
-
-
-def assert_zero_on_average(differences, errors, dof):
-    """No significant difference on average, and one of 2 % would be found (Satterthwaite)."""
-    average, variances = differences.mean(), (errors / len(errors)) ** 2
-    error = np.sqrt(variances.sum())
-    quantiles = stats.t.isf(
-        [tools.SIGNIFICANCE / 4, 1 - tools.POWER], variances.sum() ** 2 / (variances**2 / dof).sum()
-    )
-    message = f"{average:.2%} +- {error:.2%} on average: significance {tools.SIGNIFICANCE / 2}"
-    assert abs(average) <= quantiles[0] * error, message
-    assert quantiles.sum() * error <= tools.BIAS
-
-
-def compare_in_scenes(strategy, count, estimate):
-    """Compare what `estimate` returns for each of the drawn scenes; 2 % too much must be found."""
-    estimates = []
-    for_examples(lambda scene: estimates.append((*estimate(scene), scene)), strategy, count)
-    assert len(estimates) == count
-    assert_equal_in_scenes(estimates)
-    with pytest.raises(AssertionError, match="significance"):
-        assert_equal_in_scenes([(1.02 * ours, *others) for ours, *others in estimates])
 
 
 def ours_and_reference(scene):

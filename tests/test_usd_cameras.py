@@ -236,3 +236,18 @@ def test_other_up_axes_are_noted(load, axis):
     scene = load(LIGHT, {"upAxis": axis})
     assert axis in note(scene, "upAxis")
     assert scene.metadata["upAxis"] == "Y"
+
+
+def test_sensor_for_mitsuba(load):
+    lens = "float fStop = 2;float focusDistance = 7;"
+    pinhole = 'string mitsuba:sensor:type = "perspective";'
+    tent = 'string mitsuba:sensor:film:pixel_filter:type = "tent";'
+    scene = load(LIGHT + camera(lens + pinhole + tent))
+    assert scene["sensor"]["type"] == "perspective"
+    assert scene["sensor"]["film"]["rfilter"] == {"type": "tent"}
+    mi.load_dict(scene)
+    scene = load(
+        LIGHT + camera(tent.replace("tent", "round") + pinhole.replace("persp", "retrosp"))
+    )
+    assert "retrospective" in note(scene, "sensor") and "round" in note(scene, "filter type")
+    mi.load_dict(scene)

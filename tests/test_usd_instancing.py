@@ -1,5 +1,7 @@
 """Instances of USD stages: what shines shines in each place, the rest becomes Mitsuba instances."""
 
+import subprocess
+import sys
 import time
 
 import mitsuba as mi
@@ -239,7 +241,7 @@ def test_purposes_and_activation(load):
     assert [x for x, _, _ in positions_of(scene)] == [0, 2]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20, deadline=None, derandomize=True, database=None)
 @given(
     st.lists(st.tuples(*[st.floats(-3, 3)] * 3), min_size=1, max_size=4),
     st.lists(st.floats(-1, 1), min_size=4, max_size=4),
@@ -341,3 +343,47 @@ def test_separate_lamps_have_their_radiance_for_each_face(tmp_path, load):
     squares = (places**2).sum(axis=1)
     expected = np.pi * 0.01 * (values * places[:, 2] / squares**1.5).sum()
     assert_irradiance(scene, expected, rounding=0.005, spp=64, seeds=range(4))
+
+
+def test_instances_move_with_time(load):
+    places = "point3f[] positions.timeSamples = { 1: [(0, 0, 1)], 3: [(0, 0, 5)] };"
+    text = instancer([(9, 9, 9)], places)
+    assert positions_of(load(text, time=2)) == [(0, 0, 3)]
+    assert positions_of(load(text, time=3)) == [(0, 0, 5)]
+    assert positions_of(load(text)) == [(9, 9, 9)]
+    sampled = text.replace("point3f[] positions = [(9.0, 9.0, 9.0)]", "")
+    assert positions_of(load(sampled)) == [(0, 0, 1)]
+
+
+MEASURE = """
+import resource, sys, time
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+from manylights import usd
+begin = time.process_time()
+scene = usd.load(sys.argv[1])
+seconds = time.process_time() - begin
+mi.load_dict(scene)
+print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind, most", [("sphere", 10), ("mesh", 10), ("separate", 5)])
+def test_time_and_memory_of_many_lamps(tmp_path, kind, most):
+    """100,000 instances, or 10,000 separate lights."""
+    path = tmp_path / "many.usdc"
+    if kind == "separate":
+        stage = Usd.Stage.CreateNew(str(path))
+        for index in range(10_000):
+            light = UsdLux.SphereLight.Define(stage, f"/lights/light_{index}")
+            light.AddTranslateOp().Set(Gf.Vec3d(index % 100, index // 100, 0))
+            light.CreateIntensityAttr(1.0 + index)
+        stage.Save()
+    else:
+        many_lamps(path, kind, 100_000)
+    command = [sys.executable, "-c", MEASURE, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    seconds, memory = map(float, done.stdout.split())
+    assert seconds < most
+    assert memory < 2e9

@@ -15,7 +15,7 @@ path for the whole process and reads it whenever a scene asks for a plugin.
 ``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.scenes`` generates
 scenes; ``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose emitters by
 power, for comparisons. ``manylights.merge_emitters(description)`` makes scenes with thousands of
-separate lamps start in seconds.
+separate lamps start in seconds. ``manylights.usd.load(path)`` reads USD stages, with ``usd-core``.
 
 What is where, each using only those before it:
 
@@ -30,6 +30,8 @@ What is where, each using only those before it:
 """
 
 from __future__ import annotations
+
+import importlib
 
 from manylights._plugins import REQUIRED_MITSUBA, plugin_dir, register
 
@@ -50,3 +52,10 @@ __all__ = [
     "power_weights",
     "scenes",
 ]
+
+
+def __getattr__(name: str):
+    # Not imported with the package, since it needs usd-core
+    if name == "usd":
+        return importlib.import_module("manylights.usd")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -22,8 +22,12 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
         DRJIT_STRUCT(State, pi, passed, active)
     };
     State state{ pi, Float(0.f), active };
-    auto on_emitter = [](const State &s) { // scalar shapes may be null
-        return s.active && s.pi.is_valid() && s.pi.shape->emitter() != nullptr;
+    auto on_emitter = [](const State &s) { // instances have no shape yet
+        return s.active && s.pi.is_valid() && s.pi.shape != nullptr &&
+               s.pi.shape->emitter() != nullptr;
+    };
+    auto epsilon = [](const auto &p) { // that of Mitsuba's rays
+        return (1.f + dr::max(dr::abs(p))) * mitsuba::math::RayEpsilon<Float>;
     };
     loop(
         state, on_emitter,
@@ -33,8 +37,12 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
             auto si = s.pi.compute_surface_interaction(rest, +mitsuba::RayFlags::Minimal,
                                                        s.active);
             Ray3f next = si.spawn_ray(ray.d);
-            s.passed   = dr::dot(next.o - ray.o, ray.d);
-            s.pi       = scene->ray_intersect_preliminary(next, true, s.active);
+            // Along a surface the offset from it does not get ahead, and it is met for ever
+            Float least = s.passed + s.pi.t + epsilon(si.p),
+                  ahead = dr::dot(next.o - ray.o, ray.d);
+            s.passed    = dr::maximum(least, ahead);
+            next.o += ray.d * (s.passed - ahead);
+            s.pi = scene->ray_intersect_preliminary(next, true, s.active);
         },
         "Hidden emitters");
     pi = state.pi;

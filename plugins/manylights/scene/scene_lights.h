@@ -292,8 +292,8 @@ public:
             UInt32D light = dr::gather<UInt32D>(m_light_of_primitive, index, known);
             return dr::select(known, light, kNone);
         } else {
-            // Most shapes do not emit: do not look for these
-            bool emits = active && shape->emitter() != nullptr;
+            // Most shapes do not emit: do not look for these. Instances have no shape yet
+            bool emits = active && shape != nullptr && shape->emitter() != nullptr;
             auto it    = emits ? m_shape_map.find(shape) : m_shape_map.end();
             if (it == m_shape_map.end())
                 return kNone;

@@ -17,6 +17,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import os
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -117,7 +118,7 @@ def _file(path: str, defines: dict[str, str], stage: loading.UsdOptions) -> Sour
     except RuntimeError as error:
         raise UsageError(f"{path}: {one_line(error)}") from error
     # The folder tells scenes apart that are all called scene.xml.
-    folder, file_name = Path(path).resolve().parts[-2:]
+    folder, file_name = Path(os.path.abspath(path)).parts[-2:]
     text = f"{folder}/{file_name}"
     choices = {**defines, **asdict(stage)} if stage != loading.UsdOptions() else defines
     digest = hashlib.sha256(json.dumps(choices, sort_keys=True).encode())

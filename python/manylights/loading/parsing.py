@@ -154,16 +154,19 @@ def _check_images(files: list[Path]) -> None:
 class search_beside:
     """Context in which Mitsuba looks for a scene's files in the folder of ``path`` first.
 
-    The folder is that of the path as given: a link to a scene elsewhere has its files beside it.
+    The folder is that of the path as given: a link to a scene elsewhere has its files beside it,
+    or else beside its target.
     """
 
     def __init__(self, path: str) -> None:
-        self.folder = str(Path(os.path.abspath(path)).parent)
+        folders = (Path(os.path.abspath(path)).parent, Path(path).resolve().parent)
+        self.folders = [str(folder) for folder in dict.fromkeys(folders)]
 
     def __enter__(self) -> None:
         self.before = mi.file_resolver()
         resolver = type(self.before)(self.before)
-        resolver.prepend(self.folder)
+        for folder in reversed(self.folders):
+            resolver.prepend(folder)
         mi.set_file_resolver(resolver)
 
     def __exit__(self, *_) -> None:

@@ -91,10 +91,8 @@ def sensor_of(prim: Usd.Prim, context: Context, settings: Settings) -> tuple[dic
             sensor["principal_point_offset_x"] = offset_x / horizontal
             sensor["principal_point_offset_y"] = -offset_y / vertical
         values.add_lens(sensor)
-    kind = settings.sensor_type(prim)
-    if kind:
-        sensor["type"] = kind
     sensor.update(_film_and_sampler(width, height, settings))
+    settings.apply_to_sensor(prim, sensor)
     return sensor, values.exposure()
 
 

@@ -11,7 +11,8 @@ from manylights.usd.context import Context
 from manylights.usd.copies import copies
 from manylights.usd.description import transformed
 from manylights.usd.geometry import surfaces_of
-from manylights.usd.lights import Lights, transform
+from manylights.usd.light_shapes import transform
+from manylights.usd.lights import Lights
 from manylights.usd.materials import Materials
 from manylights.usd.mitsuba_meshes import checked_uv
 from manylights.usd.shining import MOST_TRIANGLES, Glow, MeshLight, add_lamps, glow_of, world_areas
@@ -20,6 +21,9 @@ from manylights.usd.traversal import Batch, Item
 
 #: More copies than this of a few triangles cost more as instances of Mitsuba than as one mesh.
 MANY_COPIES, BAKED_TRIANGLES = 256, 4_000_000
+
+#: Which of the lowest coordinates each corner of a box has.
+CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T.astype(bool)
 
 
 class Drawing:
@@ -44,7 +48,7 @@ class Drawing:
                 continue
             try:
                 quiet += self._add_shining(batch, item)
-            except (Tf.ErrorException, ValueError) as error:
+            except (Tf.ErrorException, TypeError, ValueError) as error:
                 reason = " ".join(str(error).split())
                 text = f"a geometry could not be read: {reason}"
                 self.context.notes.add("geometry", text, item.prim)
@@ -106,6 +110,9 @@ class Drawing:
         areas = None
         if any(glow.normalize for _, glow in shining):
             areas = world_areas(surfaces, worlds)
+            if not (areas > 0).all():
+                text = "a light with a zero area was left out"
+                self.context.notes.add("area", text, prim, int((areas <= 0).sum()))
         for surface, glow in shining:
             for mesh in add_lamps(self.lights.lamps, surface, glow, worlds, areas):
                 self._enter(prim, mesh)
@@ -154,8 +161,7 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
 
 
 def _box(positions: np.ndarray, matrices: np.ndarray) -> np.ndarray:
-    """Return the corners of the box of copies of points, ``(8, 3)``."""
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    corners = np.stack(np.meshgrid(*zip(low, high)), axis=-1).reshape(8, 3)
+    """Return the lowest and the highest corner of the boxes of copies of points, ``(2, 3)``."""
+    corners = np.where(CORNERS, positions.min(axis=0), positions.max(axis=0))
     moved = transformed(corners, matrices).reshape(-1, 3)
     return np.stack([moved.min(axis=0), moved.max(axis=0)])

@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Ar, Sdf, Usd
 
 from manylights.usd.context import Context
+from manylights.usd.stage import NAMED_FILES
 
 #: What Mitsuba reads.
 EXTENSIONS = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm")
@@ -60,7 +61,9 @@ def read_image(asset: Sdf.AssetPath, prim: Usd.Prim, context: Context) -> Image 
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())
         text = f"the picture {name} of a light was left out, the light is plain: it {reason}"
-        context.notes.add(f"picture {name}", text, prim)
+        named = sum(note.kind.startswith("picture ") for note in context.notes)
+        kind = f"picture {name}" if named < NAMED_FILES else "pictures"
+        context.notes.add(kind, text, prim)
         return None
 
 

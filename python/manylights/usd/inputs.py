@@ -37,6 +37,10 @@ FALLBACKS = {
 #: Those of some types.
 TYPED_FALLBACKS = {("DistantLight", "intensity"): 50000.0}
 
+#: What Cycles shines with, over what Blender's export means: that writes power over pi, for the sun
+#: a quarter of its irradiance. Area lights of Cycles have a radiance of power over 4 areas.
+BLENDER_FACTORS = {"DistantLight": 4.0, "RectLight": math.pi / 4, "DiskLight": math.pi / 4}
+
 #: Before USD 21.05 inputs of lights had no ``inputs:``.
 LEGACY = tuple(name for name in FALLBACKS if name not in ("diffuse", "specular", "shadow:enable"))
 
@@ -104,6 +108,8 @@ class LightInputs:
             scale = float(self.get("intensity")) * 2.0 ** float(self.get("exposure"))
         except OverflowError:
             scale = math.inf
+        if self.context.blender_light_units:
+            scale *= BLENDER_FACTORS.get(str(self.prim.GetTypeName()), 1.0)
         color = np.array(self.get("color"), dtype=np.float64) * scale
         if self.get("enableColorTemperature"):
             kelvin = float(self.get("colorTemperature"))

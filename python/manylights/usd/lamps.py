@@ -13,9 +13,6 @@ from manylights.usd.description import MeshShape, copied_faces, transformed, tri
 #: the attribute ``face_color``, which only ours can.
 SEPARATE_RADIANCES = 8
 
-#: The same in spectral variants, where an attribute has another spectrum than a light.
-SEPARATE_SPECTRA = 1000
-
 
 @dataclass
 class _Part:
@@ -87,18 +84,27 @@ class Lamps:
         values, which = _distinct(copies)
         which = np.repeat(which, np.concatenate(sizes))
         bsdf = parts[0].bsdf
-        most = SEPARATE_SPECTRA if "spectral" in mi.variant() else SEPARATE_RADIANCES
         if len(values) == 1:
             return [MeshShape(positions, faces, bsdf=bsdf, radiance=constant(values[0]))]
-        if len(values) <= most:
+        if len(values) <= SEPARATE_RADIANCES:
             return [
                 _select(positions, faces[which == index], bsdf, constant(value))
                 for index, value in enumerate(values)
             ]
         self.uses_attribute = True
-        mesh = MeshShape(positions, faces, bsdf=bsdf, attributes={"face_color": values[which]})
-        mesh.radiance = {"type": "mesh_attribute", "name": "face_color"}
-        return [mesh]
+        return [_with_attribute(positions, faces, values[which], bsdf)]
+
+
+def _with_attribute(positions, faces, radiance: np.ndarray, bsdf) -> MeshShape:
+    """Return a mesh with a radiance, ``(m, 3)``, for each face."""
+    texture = {"type": "mesh_attribute", "name": "face_color"}
+    if "spectral" in mi.variant():
+        # An attribute is a reflectance there: up to 1, and without the white of lamps
+        peak = max(float(radiance.max()), np.finfo(np.float32).tiny)
+        radiance = radiance / np.float32(peak)
+        texture = {"type": "d65", "nested": texture, "scale": peak}
+    attributes = {"face_color": radiance}
+    return MeshShape(positions, faces, bsdf=bsdf, attributes=attributes, radiance=texture)
 
 
 def constant(radiance) -> dict:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mitsuba as mi
 import numpy as np
 from pxr import Tf, Usd
 
@@ -20,12 +19,10 @@ from manylights.usd.domes import Domes
 from manylights.usd.images import read_image
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
+from manylights.usd.light_shapes import AREAS, EXACT, SHAPES, corners, facing, scaled, unmirrored
 
 #: Round lights up to this number stay exact shapes, flat ones up to the other.
 MOST_ROUND, MOST_FLAT = 1000, 32
-
-#: Radius over the size of the scene below which Mitsuba's spheres lose accuracy.
-SMALLEST_SPHERE = 0.005
 
 #: Levels of icospheres for few, thousands, and more spheres.
 SPHERE_LEVELS = ((MOST_ROUND, 2), (10_000, 1), (float("inf"), 0))
@@ -97,14 +94,14 @@ class Lights:
 
     def _sphere(self, inputs: LightInputs, radiance, matrices) -> None:
         radius = inputs.length("radius")
-        matrices = _scaled(matrices, radius, radius, radius)
+        matrices = scaled(matrices, radius, radius, radius)
         if radius == 0 or inputs.own("treatAsPoint", False):
             self._point(inputs, radiance, matrices, radius == 0)
         else:
             self._area_light("sphere", inputs, radiance, matrices)
 
     def _rect(self, inputs: LightInputs, radiance, matrices) -> None:
-        matrices = _scaled(matrices, inputs.length("width"), inputs.length("height"), 1.0)
+        matrices = scaled(matrices, inputs.length("width"), inputs.length("height"), 1.0)
         image = None
         if inputs.file("texture:file"):
             image = read_image(inputs.file("texture:file"), inputs.prim, self.context)
@@ -115,14 +112,14 @@ class Lights:
 
     def _disk(self, inputs: LightInputs, radiance, matrices) -> None:
         radius = inputs.length("radius")
-        self._area_light("disk", inputs, radiance, _scaled(matrices, radius, radius, 1.0))
+        self._area_light("disk", inputs, radiance, scaled(matrices, radius, radius, 1.0))
 
     def _cylinder(self, inputs: LightInputs, radiance, matrices) -> None:
         radius = inputs.length("radius")
         if inputs.own("treatAsLine", False):
             text = "a light that is to be treated as a line keeps its radius"
             self.context.notes.add("treatAsLine", text, inputs.prim)
-        matrices = _scaled(matrices, inputs.length("length"), radius, radius)
+        matrices = scaled(matrices, inputs.length("length"), radius, radius)
         self._area_light("cylinder", inputs, radiance, matrices)
 
     def _distant(self, inputs: LightInputs, radiance, matrices) -> None:
@@ -189,8 +186,8 @@ class Lights:
         areas = AREAS[kind](matrices[:, :3, :3])
         good = self._good(areas, [inputs.prim], [len(areas)])
         matrices, areas = matrices[good], areas[good]
-        facing = {"sphere": 1 / 4, "cylinder": 1 / np.pi}.get(kind, 1.0)
-        share = np.full(len(areas), facing) if normalize else areas * facing
+        seen = {"sphere": 1 / 4, "cylinder": 1 / np.pi}.get(kind, 1.0)
+        share = np.full(len(areas), seen) if normalize else areas * seen
         intensities = np.outer(share, radiance)
         shaping.add_spots(self, cone, kind, matrices, intensities, inputs.prim)
         self._points.append(matrices[:, 3, :3])
@@ -206,13 +203,13 @@ class Lights:
         textures = {}
         for matrix, area in zip(matrices[good], areas[good]):
             scale = radiance / (area if inputs.get("normalize") else 1.0)
-            to_world, mirrored = _facing(matrix)
+            to_world, mirrored = facing(matrix)
             key = (*scale, mirrored)
             if key not in textures:
-                textures[key] = image.texture(scale, _unmirrored(mirrored))
+                textures[key] = image.texture(scale, unmirrored(mirrored))
             emitter = {"type": "area", "radiance": textures[key]}
             self.emit("rectangle", to_world=to_world, emitter=emitter)
-        self._points.append(_corners(matrices[good]))
+        self._points.append(corners(matrices[good]))
         self._shine(radiance, int(good.sum()))
 
     def _good(self, areas: np.ndarray, prims: list, counts: list[int]) -> np.ndarray:
@@ -236,8 +233,8 @@ class Lights:
 
     def points(self) -> np.ndarray:
         """Return points that span the lights in the world, ``(n, 3)``."""
-        corners = [_corners(light.matrices) for kind in self._kinds.values() for light in kind]
-        return np.concatenate([np.zeros((0, 3)), *corners, *self._points])
+        spans = [corners(light.matrices) for kind in self._kinds.values() for light in kind]
+        return np.concatenate([np.zeros((0, 3)), *spans, *self._points])
 
     def finish(self, size: float) -> None:
         """Turn what was read into entries and lamps; ``size`` is that of the scene."""
@@ -285,17 +282,6 @@ class Lights:
         self.lamps.add(points, faces, matrices, radiance, areas=areas)
 
 
-def _scaled(matrices: np.ndarray, x: float, y: float, z: float) -> np.ndarray:
-    return np.array([[x], [y], [z], [1.0]]) * matrices
-
-
-def _corners(matrices: np.ndarray) -> np.ndarray:
-    """Return two opposite corners, of eight, of unit cubes: enough for the size of a scene."""
-    diagonal = np.abs(matrices[:, :3, :3]).sum(axis=1)
-    centres = matrices[:, 3, :3]
-    return np.concatenate([centres - diagonal, centres + diagonal])
-
-
 def _note_visibility(inputs: LightInputs) -> None:
     private = {"inputs:visibility:camera", "primvars:arnold:camera", "karma:light:renderlightgeo"}
     if not private.isdisjoint(inputs.authored):
@@ -303,110 +289,6 @@ def _note_visibility(inputs: LightInputs) -> None:
         inputs.context.notes.add("visibility", f"{text}, hide_emitters hides all", inputs.prim)
 
 
-# -- Shapes of Mitsuba from matrices of unit shapes
-
-
-def transform(matrix: np.ndarray):
-    """Return a matrix for row vectors as a transform of Mitsuba."""
-    return mi.ScalarTransform4f(np.ascontiguousarray(matrix.T))
-
-
-def _facing(matrix: np.ndarray):
-    """Return the transform of a ``rectangle`` or ``disk`` over the unit square that faces -Z.
-
-    Mitsuba's mirrored rectangles face the other way: here a mirrored one is mirrored once more.
-    """
-    x, y = matrix[0, :3] / 2, matrix[1, :3] / 2
-    mirrored = np.linalg.det(matrix[:3, :3]) < 0
-    normal = np.cross(y, x) if not mirrored else np.cross(x, y)
-    if mirrored:
-        x = -x
-    length = np.linalg.norm(normal)
-    rows = np.stack([x, -y, normal / max(length, np.finfo(float).tiny)])
-    result = np.eye(4)
-    result[:3, :3], result[3, :3] = rows, matrix[3, :3]
-    return transform(result), mirrored
-
-
-def _unmirrored(mirrored: bool):
-    """Return the ``to_uv`` with which a picture is not mirrored."""
-    if mirrored:
-        return mi.ScalarTransform4f()
-    return mi.ScalarTransform4f().translate([1, 0, 0]) @ mi.ScalarTransform4f().scale([-1, 1, 1])
-
-
-def _as_sphere(matrix) -> dict:
-    radius = float(shapes.scale_of(matrix[None, :3, :3])[0])
-    return {"kind": "sphere", "center": matrix[3, :3].tolist(), "radius": radius}
-
-
-def _as_rectangle(matrix) -> dict:
-    return {"kind": "rectangle", "to_world": _facing(matrix)[0]}
-
-
-def _as_disk(matrix) -> dict:
-    return {"kind": "disk", "to_world": _facing(_scaled(matrix[None], 2, 2, 1)[0])[0]}
-
-
-def _as_cylinder(matrix) -> dict:
-    half, centre = matrix[0, :3] / 2, matrix[3, :3]
-    radius = float(np.linalg.norm(matrix[1, :3]))
-    ends = {"p0": (centre - half).tolist(), "p1": (centre + half).tolist()}
-    return {"kind": "cylinder", "radius": radius, **ends}
-
-
-def _exact_spheres(matrices, size: float) -> np.ndarray:
-    linear = matrices[:, :3, :3]
-    large = shapes.scale_of(linear) >= SMALLEST_SPHERE * size
-    return shapes.is_uniform(linear) & large
-
-
-def _exact_rects(matrices, size: float) -> np.ndarray:
-    return np.ones(len(matrices), dtype=bool)
-
-
-def _exact_disks(matrices, size: float) -> np.ndarray:
-    x, y = matrices[:, 0, :3], matrices[:, 1, :3]
-    return _round(x, y)
-
-
-def _exact_cylinders(matrices, size: float) -> np.ndarray:
-    axis, y, z = (matrices[:, row, :3] for row in range(3))
-    lengths = np.linalg.norm(axis, axis=1), np.linalg.norm(y, axis=1), np.linalg.norm(z, axis=1)
-    lean = np.abs((axis * y).sum(axis=1)) / (lengths[0] * lengths[1])
-    lean += np.abs((axis * z).sum(axis=1)) / (lengths[0] * lengths[2])
-    return _round(y, z) & (lean < shapes.ROUNDING)
-
-
-def _round(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Are these pairs of vectors orthogonal and of one length?"""
-    square = (x**2).sum(axis=1)
-    difference = np.abs(square - (y**2).sum(axis=1)) + np.abs((x * y).sum(axis=1))
-    return difference <= shapes.ROUNDING * square
-
-
-def _disk_areas(linear: np.ndarray) -> np.ndarray:
-    return np.pi * shapes.flat_areas(linear)
-
-
-AREAS = {
-    "sphere": shapes.sphere_areas,
-    "rect": shapes.flat_areas,
-    "disk": _disk_areas,
-    "cylinder": shapes.tube_areas,
-}
-EXACT = {
-    "sphere": _exact_spheres,
-    "rect": _exact_rects,
-    "disk": _exact_disks,
-    "cylinder": _exact_cylinders,
-}
-SHAPES = {
-    "sphere": _as_sphere,
-    "rect": _as_rectangle,
-    "disk": _as_disk,
-    "cylinder": _as_cylinder,
-}
 READERS = {
     "SphereLight": Lights._sphere,
     "RectLight": Lights._rect,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from manylights.errors import one_line
 from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
 from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
@@ -11,8 +12,14 @@ from manylights.usd.description import instantiate
 from manylights.usd.drawing import Drawing
 from manylights.usd.lights import Lights
 from manylights.usd.settings import Settings
-from manylights.usd.stage import guarded, layer_files, open_stage, time_of
+from manylights.usd.stage import StageError, guarded, layer_files, open_stage, time_of
 from manylights.usd.traversal import collect
+
+#: What prims of a stage may be for.
+PURPOSES = ("default", "render", "proxy", "guide")
+
+#: Each level has four times as many faces: more fill the memory.
+MOST_SUBDIVISION = 8
 
 
 class SceneDict(dict):
@@ -100,6 +107,9 @@ def describe(
     blender_light_units=False,
 ) -> SceneDict:
     """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet."""
+    purposes = _purposes(purposes)
+    if subdivision is not None and not 0 <= subdivision <= MOST_SUBDIVISION:
+        raise StageError(f"subdivision {subdivision}: 0 to {MOST_SUBDIVISION} levels are possible")
     notes = Notes()
     with guarded(path):
         stage = open_stage(path, notes)
@@ -107,13 +117,21 @@ def describe(
             stage=stage,
             time=time_of(stage, time),
             notes=notes,
-            purposes=tuple(purposes),
+            purposes=purposes,
             subdivision=subdivision,
             legacy_lights=legacy_lights,
             blender_light_units=blender_light_units,
         )
         skinning.bake(context)
         return _read(context, camera, default_light)
+
+
+def _purposes(purposes) -> tuple[str, ...]:
+    purposes = (purposes,) if isinstance(purposes, str) else tuple(purposes)
+    for purpose in purposes:
+        if purpose not in PURPOSES:
+            raise StageError(f"purpose {purpose!r}: it has to be one of {', '.join(PURPOSES)}")
+    return purposes
 
 
 def _read(context: Context, camera, default_light: bool) -> SceneDict:
@@ -135,14 +153,7 @@ def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_l
     lights.finish(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0)
     settings = Settings(context)
     scene = SceneDict(type="scene")
-    prim = cameras.choose_camera(context, camera, settings)
-    scene.exposure, scene.camera = 1.0, None
-    if prim is None:
-        shown = geometry if len(geometry) else points
-        scene["sensor"] = cameras.framing_sensor(context, shown, settings)
-    else:
-        scene["sensor"], scene.exposure = cameras.sensor_of(prim, context, settings)
-        scene.camera = str(prim.GetPath())
+    _add_sensor(scene, context, settings, camera, geometry if len(geometry) else points)
     scene.update(lights.entries)
     meshes = lights.lamps.meshes()
     scene.update({f"lamps_{index}": mesh for index, mesh in enumerate(meshes)})
@@ -156,6 +167,22 @@ def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_l
     scene.metadata = _metadata(context)
     scene.files = layer_files(context.stage)
     return scene
+
+
+def _add_sensor(scene: SceneDict, context: Context, settings: Settings, camera, points) -> None:
+    prim = cameras.choose_camera(context, camera, settings)
+    scene.exposure, scene.camera = 1.0, None if prim is None else str(prim.GetPath())
+    try:
+        if prim is None:
+            scene["sensor"] = cameras.framing_sensor(context, points, settings)
+        else:
+            scene["sensor"], scene.exposure = cameras.sensor_of(prim, context, settings)
+    except StageError:
+        raise
+    except (TypeError, ValueError) as error:
+        places = [str(part.GetPath()) for part in (prim, settings.prim) if part]
+        text = f"{' or '.join(places)}: an attribute of the wrong type: {one_line(error)}"
+        raise StageError(text) from None
 
 
 def _integrator(context: Context, settings: Settings, uses_attribute: bool) -> dict:

@@ -11,6 +11,9 @@ from manylights.usd.context import Context
 #: More pixels than this along a side are a slip.
 LARGEST_SIDE = 65536
 
+#: Mitsuba's filters of pixels.
+FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
+
 
 class Settings:
     """The render settings to use, perhaps none.
@@ -97,10 +100,25 @@ class Settings:
             return None
         return int(value)
 
-    def sensor_type(self, camera: Usd.Prim) -> str | None:
-        """Return the sensor that a camera, or the settings, ask for."""
-        attribute = camera.GetAttribute("mitsuba:sensor:type")
-        value = self.context.value(attribute) if attribute else self._value("mitsuba:sensor:type")
+    def apply_to_sensor(self, camera: Usd.Prim, sensor: dict) -> None:
+        """Choose a pinhole and the filter of pixels, if a camera or the settings ask for it."""
+        kind = self._of_camera(camera, "mitsuba:sensor:type") or sensor["type"]
+        if (kind, sensor["type"]) == ("perspective", "thinlens"):
+            del sensor["aperture_radius"], sensor["focus_distance"]
+            sensor["type"] = kind
+        elif kind != sensor["type"]:
+            text = f"mitsuba:sensor:type {kind} was ignored, used was {sensor['type']}"
+            self.context.notes.add("sensor", text, camera)
+        name = self._of_camera(camera, "mitsuba:sensor:film:pixel_filter:type")
+        if name in FILTERS:
+            sensor["film"]["rfilter"] = {"type": name}
+        elif name:
+            text = f"the pixel filter {name} is none of {', '.join(FILTERS)}: box was used"
+            self.context.notes.add("filter type", text, camera)
+
+    def _of_camera(self, camera: Usd.Prim, name: str) -> str | None:
+        attribute = camera.GetAttribute(name)
+        value = self.context.value(attribute) if attribute else self._value(name)
         return str(value) if value else None
 
     def integrator(self) -> dict | None:

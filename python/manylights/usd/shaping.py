@@ -15,6 +15,7 @@ import numpy as np
 from pxr import UsdLux
 
 from manylights.usd.inputs import LightInputs
+from manylights.usd.vectors import unit
 
 #: Spots on the surface of a light, along each side.
 GRID = 4
@@ -93,24 +94,22 @@ def add_spots(lights, cone: Cone, kind: str, matrices, intensities, prim) -> Non
     """
     places = _places(kind) if len(matrices) <= FEW_LIGHTS else np.zeros((1, 3))
     count = len(places) * len(matrices)
-    texture, peak = None, 1.0
+    texture = None
     needed = kind != "sphere" or cone.softness > 0 or cone.focus > 0
     if needed and cone.angle <= WIDEST_TEXTURE and count <= MOST_TEXTURED:
-        values, peak = _texture(cone, kind)
+        texture = _texture(cone, kind)
         name = f"cone_{len(lights.entries)}"
-        texture = lights.entries[name] = values
-    for matrix, intensity in zip(matrices, intensities):
-        frame = _frame(matrix, kind)
-        for place in places @ matrix[:3, :3] + matrix[3, :3]:
-            to_world = np.eye(4)
-            to_world[:3, :3], to_world[:3, 3] = frame.T, place
-            value = [float(channel) for channel in intensity * peak / len(places)]
-            spot = {
-                "to_world": mi.ScalarTransform4f(to_world),
-                "intensity": {"type": "rgb", "value": value},
-                "cutoff_angle": cone.angle,
-                "beam_width": (1.0 - cone.softness) * cone.angle,
-            }
+        lights.entries[name] = texture
+    beam = (1.0 - cone.softness) * cone.angle
+    to_world = np.tile(np.eye(4), (len(matrices), 1, 1))
+    to_world[:, :3, :3] = np.swapaxes(_frames(matrices, kind), 1, 2)
+    values = (intensities / len(places)).tolist()
+    for place in places:
+        to_world[:, :3, 3] = place @ matrices[:, :3, :3] + matrices[:, 3, :3]
+        for frame, value in zip(to_world, values):
+            spot = {"to_world": mi.ScalarTransform4f(frame), "cutoff_angle": cone.angle}
+            spot["intensity"] = {"type": "rgb", "value": value}
+            spot["beam_width"] = beam
             if texture is not None:
                 spot["texture"] = {"type": "ref", "id": name}
             lights.emit("spot", **spot)
@@ -138,25 +137,24 @@ def _places(kind: str) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * radius], axis=1)
 
 
-def _frame(matrix: np.ndarray, kind: str) -> np.ndarray:
-    """Return the axes of a spot as rows: Z is where it points, X along that of a cylinder."""
-    x, y, z = matrix[:3, :3]
+def _frames(matrices: np.ndarray, kind: str) -> np.ndarray:
+    """Return the axes of spots as rows: Z is where they point, X along that of a cylinder."""
+    x, y, z = (matrices[:, row, :3] for row in range(3))
     axis = -z
     if kind in ("rect", "disk"):
-        normal = np.cross(x, y)
-        axis = -normal if np.dot(normal, z) > 0 else normal
-    if not np.any(axis):
-        axis = np.array([0.0, 0.0, -1.0])
-    axis = axis / np.linalg.norm(axis)
-    side = x - np.dot(x, axis) * axis
-    if np.linalg.norm(side) < 1e-9 * max(np.linalg.norm(x), 1e-300):
-        side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    side = side / np.linalg.norm(side)
-    return np.stack([side, np.cross(axis, side), axis])
+        axis = np.cross(x, y)
+        axis *= np.where((axis * z).sum(axis=1) > 0, -1.0, 1.0)[:, None]
+    axis = np.where(axis.any(axis=1, keepdims=True), axis, (0.0, 0.0, -1.0))
+    axis = unit(axis)
+    side = x - (x * axis).sum(axis=1, keepdims=True) * axis
+    lost = np.linalg.norm(side, axis=1) <= 1e-9 * np.linalg.norm(x, axis=1)
+    side[lost] = np.cross(axis[lost], np.eye(3)[np.abs(axis[lost]).argmin(axis=1)])
+    side = unit(side)
+    return np.stack([side, np.cross(axis, side), axis], axis=1)
 
 
-def _texture(cone: Cone, kind: str) -> tuple[dict, float]:
-    """Return a texture that turns Mitsuba's spot into the cone of a light, and its scale."""
+def _texture(cone: Cone, kind: str) -> dict:
+    """Return a texture that turns Mitsuba's spot into the cone of a light."""
     extent = np.tan(np.radians(cone.angle))
     x = ((np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1) * extent
     x, y = np.meshgrid(x, x)
@@ -168,6 +166,5 @@ def _texture(cone: Cone, kind: str) -> tuple[dict, float]:
         values = values * np.cos(theta)
     if kind == "cylinder":
         values = values * np.sqrt((1 + y * y) / (1 + x * x + y * y))
-    peak = float(values.max())
-    bitmap = mi.Bitmap((values / peak).astype(np.float32)[:, :, None])
-    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}, peak
+    bitmap = mi.Bitmap(values.astype(np.float32)[:, :, None])
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}

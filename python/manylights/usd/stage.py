@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, one_line
 from manylights.usd.context import Notes
 
 #: Files with notes of their own; further missing ones share one.
@@ -63,6 +63,9 @@ def guarded(path):
         yield
     except Tf.ErrorException as error:
         raise StageError(f"{os.fspath(path)}: {_reason(str(error))}") from None
+    except (UnicodeDecodeError, MemoryError) as error:
+        # Names and sizes of a damaged file
+        raise StageError(f"{os.fspath(path)}: broken: {one_line(error)}") from None
     finally:
         delegate.TakeUncoalescedDiagnostics()
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdLux
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
+from manylights.errors import one_line
 from manylights.usd.context import Context
 
 #: More copies than this of one prototype do not fit into memory.
@@ -123,7 +124,12 @@ class _Traversal:
         stack = [(root, state)]
         while stack:
             prim, state = stack.pop()
-            below = self._visit(prim, state, batch, prim == root)
+            try:
+                below = self._visit(prim, state, batch, prim == root)
+            except (TypeError, ValueError, Tf.ErrorException) as error:
+                text = f"a prim and all below it was left out: {one_line(error)}"
+                self.context.notes.add("prim", text, prim)
+                continue
             if below is not None:
                 children = prim.GetFilteredChildren(predicate)
                 stack.extend((child, below) for child in reversed(children))
@@ -134,17 +140,15 @@ class _Traversal:
         if prim.IsPseudoRoot():
             return state
         role = self._role(prim)
-        if role in ("untyped", "looked up"):
-            return state if role == "untyped" else None
+        if role == "foreign":
+            text = f"prims of the foreign type {prim.GetTypeName()} are left out"
+            self.context.notes.add(f"type {prim.GetTypeName()}", text, prim)
+        if role in ("untyped", "foreign", "looked up"):
+            return None if role == "looked up" else state
         imageable = UsdGeom.Imageable(prim)
         if self.context.value(imageable.GetVisibilityAttr()) == UsdGeom.Tokens.invisible:
             return None
-        try:
-            state = self._enter(prim, imageable, state, is_root)
-        except ValueError as error:
-            text = f"a prim and all below it was left out: {error}"
-            self.context.notes.add("transform", text, prim)
-            return None
+        state = self._enter(prim, imageable, state, is_root)
         if prim.IsInstance() and not is_root:
             key = (prim.GetPrototype().GetPath(), state.purpose, self._inheritance(prim))
             self._native.setdefault(key, []).append((prim, state))
@@ -296,5 +300,6 @@ def _role_of(prim: Usd.Prim) -> str:
     if prim.HasAPI(UsdLux.LightAPI):
         return "light"
     if not prim.IsA(UsdGeom.Imageable):
-        return "untyped"
+        known = not name or Usd.SchemaRegistry.IsConcrete(name)
+        return "untyped" if known else "foreign"
     return "container" if name in CONTAINERS else "unknown"
