@@ -1,6 +1,7 @@
-"""How the Python package is laid out: who imports whom, and how long things are."""
+"""How the code is laid out: who imports or includes whom, and how long things are."""
 
 import ast
+import re
 from collections import defaultdict
 from pathlib import Path
 
@@ -73,3 +74,43 @@ def test_no_two_classes_have_one_name():
             if isinstance(node, ast.ClassDef):
                 homes[node.name].append(".".join(parts))
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+
+
+# ------------------------------------------------------------------------------------- the plugins
+
+PLUGINS = PACKAGE.parents[1] / "plugins" / "manylights"
+
+#: Folders of the C++, in the order of the data: each includes only those before it, and itself.
+FOLDERS = ("base", "table", "receiver", "learning", "tree", "choice", "scene", "direct", "paths")
+FOLDERS += ("render", "plugin")
+
+INCLUDE = re.compile(r'#include ["<]manylights/(\w+)/')
+
+
+def includes_that_climb(sources):
+    """Return every pair of a folder and a later one of which it includes a file."""
+    return {
+        (folder, included)
+        for folder, text in sources
+        for included in INCLUDE.findall(text)
+        if FOLDERS.index(included) > FOLDERS.index(folder)
+    }
+
+
+def sources_of_plugins():
+    """Return folder and text of each file."""
+    files = [path for path in sorted(PLUGINS.rglob("*")) if path.suffix in (".h", ".cpp")]
+    return [(path.parent.name, path.read_text()) for path in files]
+
+
+def test_every_folder_of_the_plugins_has_its_place():
+    assert {path.name for path in PLUGINS.iterdir()} == set(FOLDERS)
+
+
+def test_folders_include_only_those_before_them():
+    assert includes_that_climb(sources_of_plugins()) == set()
+
+
+def test_an_include_of_a_later_folder_is_found():
+    wrong = '#include "manylights/direct/vertex.h"\n#include "manylights/base/loop.h"'
+    assert includes_that_climb([("tree", wrong)]) == {("tree", "direct")}
