@@ -572,6 +572,9 @@ def test_one_note_a_kind(load, attributes, kind, word):
     assert word in text
     assert "3 times" in text and "/light_0" in text
     assert len(emitters(scene, "sphere")) == 3
+    text = note(load(lights[1]), kind)
+    assert word in text
+    assert re.search(r"\b1 time\b", text) and "/light_1" in text
 
 
 @pytest.mark.parametrize("attributes", ["rel light:filters;", "float inputs:diffuse = 1;"])

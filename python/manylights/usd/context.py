@@ -26,8 +26,8 @@ class Note:
     @property
     def text(self) -> str:
         """The sentence, how often, and the first prim's path."""
-        times = f" ({self.count} times, first at {self.prim})" if self.count > 1 else ""
-        return f"{self.message}{times or f' ({self.prim})'}"
+        times = f"{self.count} times, first at" if self.count > 1 else "1 time, at"
+        return f"{self.message} ({times} {self.prim})"
 
 
 class Notes(list):
