@@ -234,7 +234,10 @@ def read_image(path: str) -> np.ndarray | None:
         file = os.path.join(folder, os.path.basename(path).rstrip("]"))
         with open(file, "wb") as copy:
             copy.write(asset.GetBuffer())
-        return read_image(file)
+        try:
+            return read_image(file)
+        except RuntimeError as error:
+            raise RuntimeError(str(error).replace(file, path)) from None
 
 
 def check_size(width: int, height: int) -> None:
