@@ -54,7 +54,7 @@ class Context:
         purposes: of the prims that are read.
         subdivision: levels for meshes without an authored scheme; ``None``: the cage.
         legacy_lights: read the inputs of lights from before USD 21.05?
-        blender_light_units: are lights in Blender's units?
+        blender_light_units: are lights as Blender exports them?
     """
 
     stage: Usd.Stage
