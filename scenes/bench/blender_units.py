@@ -5,8 +5,8 @@
 
 Each light stands alone above a grey, diffuse plane. Blender renders it with Cycles, direct light
 only, and exports the same scene; manylights renders the file. The ratios are means of our image
-over Cycles', as the file says it and with `blender_light_units`, for two sizes of each kind, and
-for an area light in an object that is scaled.
+over Cycles', as the file says it and with `blender_light_units`, for two sizes of each kind, for
+objects that are scaled, for meshes that glow and for the world.
 """
 
 from __future__ import annotations
@@ -38,12 +38,10 @@ LIGHTS = (
     ("disk, 0.5", "AREA", {"shape": "DISK", "size": 0.5}, 1),
     ("disk, 2", "AREA", {"shape": "DISK", "size": 2.0}, 1),
     ("ellipse, 1 x 2", "AREA", {"shape": "ELLIPSE", "size": 1.0, "size_y": 2.0}, 1),
-    (
-        "point, radius 0.2, not normalized",
-        "POINT",
-        {"shadow_soft_size": 0.2, "normalize": False},
-        1,
-    ),
+    ("glowing mesh, 0.5", "MESH", {"size": 0.5}, 1),
+    ("glowing mesh, 1, scaled by 2", "MESH", {"size": 1.0}, 2),
+    ("world", "WORLD", {}, 1),
+    ("point, 0.2, not normalized", "POINT", {"shadow_soft_size": 0.2, "normalize": False}, 1),
     ("sun, 10 degrees, not normalized", "SUN", {"angle": 0.1745, "normalize": False}, 1),
     ("square, 2, not normalized", "AREA", {"size": 2.0, "normalize": False}, 1),
     ("square, 1, scaled by 2, not normalized", "AREA", {"size": 1.0, "normalize": False}, 2),
@@ -60,13 +58,8 @@ def with_blender(folder: Path) -> None:
     for index, (_, kind, settings, scale) in enumerate(LIGHTS):
         bpy.ops.wm.read_factory_settings(use_empty=True)
         plane = _add_plane(bpy)
-        light = bpy.data.lights.new("light", kind)
-        light.energy = 3.0 if kind == "SUN" else 100.0
-        for name, value in settings.items():
-            setattr(light, name, value)
-        item = bpy.data.objects.new("light", light)
+        item = _add_light(bpy, kind, settings)
         item.location, item.scale = (0.0, 0.0, 3.0), (scale, scale, scale)
-        bpy.context.collection.objects.link(item)
         camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
         camera.data.lens = 150.0
         camera.location, camera.rotation_euler = (0.0, -6.0, 6.0), (0.7854, 0.0, 0.0)
@@ -75,6 +68,39 @@ def with_blender(folder: Path) -> None:
         # The plane is diffuse without a material, and of this grey
         plane.data.materials.clear()
         bpy.ops.wm.usd_export(filepath=str(folder / f"{index}.usdc"))
+
+
+def _add_light(bpy, kind: str, settings: dict):
+    """Add a light of Blender, a mesh that glows, or the world; return its object."""
+    if kind == "MESH":
+        return _add_glowing_mesh(bpy, settings["size"])
+    if kind == "WORLD":
+        world = bpy.context.scene.world = bpy.data.worlds.new("world")
+        world.use_nodes = True
+        background = world.node_tree.nodes["Background"]
+        background.inputs["Color"].default_value = (0.6, 0.6, 0.6, 1.0)
+        background.inputs["Strength"].default_value = 2.0
+        item = bpy.data.objects.new("nothing", None)
+    else:
+        light = bpy.data.lights.new("light", kind)
+        light.energy = 3.0 if kind == "SUN" else 100.0
+        for name, value in settings.items():
+            setattr(light, name, value)
+        item = bpy.data.objects.new("light", light)
+    bpy.context.collection.objects.link(item)
+    return item
+
+
+def _add_glowing_mesh(bpy, size: float):
+    bpy.ops.mesh.primitive_plane_add(size=size)
+    material = bpy.data.materials.new("glow")
+    material.use_nodes = True
+    inputs = material.node_tree.nodes["Principled BSDF"].inputs
+    inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    inputs["Emission Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    inputs["Emission Strength"].default_value = 5.0
+    bpy.context.object.data.materials.append(material)
+    return bpy.context.object
 
 
 def _add_plane(bpy):
