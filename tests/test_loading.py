@@ -21,6 +21,8 @@ class Stage(dict):
     """What `manylights.usd.load` returns."""
 
     notes = (types.SimpleNamespace(text="one light has a profile that is not read (/Lamp)"),)
+    exposure = 1.0
+    files = ()
 
 
 def stage():
@@ -52,6 +54,7 @@ def usd(monkeypatch, tmp_path):
         return stage()
 
     reader.load = load
+    monkeypatch.setattr(Stage, "files", [str(reader.path)])
     monkeypatch.setitem(sys.modules, "manylights.usd", reader)
     monkeypatch.setattr(manylights, "usd", reader, raising=False)
     return reader
@@ -71,7 +74,7 @@ def test_a_stage_goes_the_same_way_as_xml(usd, scalar):
 
 
 def test_layers_of_a_stage_are_among_its_files(usd, scalar, monkeypatch):
-    monkeypatch.setattr(Stage, "files", ["stage.usda", "lamps.usdc"], raising=False)
+    monkeypatch.setattr(Stage, "files", ["stage.usda", "lamps.usdc"])
     assert loading.load(str(usd.path)).files == [Path("stage.usda"), Path("lamps.usdc")]
 
 
@@ -87,20 +90,15 @@ def test_defaults_of_a_stage_are_refused(usd, scalar):
         loading.load(str(usd.path), {"spp": "4"})
 
 
-def test_missing_usd_core_is_named(usd, monkeypatch, capsys, tmp_path):
-    monkeypatch.delattr(manylights, "usd")
-    monkeypatch.setitem(sys.modules, "manylights.usd", None)
-
-    class Finder:
-        """Finds the reader, which then misses pxr."""
-
-        def find_spec(self, name, *_):
-            if name == "manylights.usd":
-                raise ModuleNotFoundError("No module named 'pxr'", name="pxr")
-
-    monkeypatch.delitem(sys.modules, "manylights.usd")
-    monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
-    command = ["render", str(usd.path), "-o", str(tmp_path / "out.exr"), "--variant", "scalar_rgb"]
+def test_missing_usd_core_is_named(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "stage.usda"
+    path.write_text("#usda 1.0\n")
+    monkeypatch.delattr(manylights, "usd", raising=False)
+    for name in list(sys.modules):
+        if name.partition(".")[0] == "pxr" or name.startswith("manylights.usd"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    command = ["render", str(path), "-o", str(tmp_path / "out.exr"), "--variant", "scalar_rgb"]
     assert main(command) == 2
     assert "pip install 'manylights[usd]'" in capsys.readouterr().err
 

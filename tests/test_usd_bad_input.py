@@ -255,6 +255,28 @@ def test_broken_pictures(usd, tmp_path, name, kind):
     mi.load_dict(scene)
 
 
+@pytest.mark.parametrize("part", [0.3, 0.9])
+def test_truncated_picture_in_a_package(usd, tmp_path, part):
+    """In a process of its own: read from memory, such a picture never ends."""
+    mi.Bitmap(np.ones((32, 64, 3), dtype=np.float32)).write(str(tmp_path / "sky.exr"))
+    picture = (tmp_path / "sky.exr").read_bytes()
+    (tmp_path / "sky.exr").write_bytes(picture[: int(part * len(picture))])
+    text = 'def DomeLight "sky" {;asset inputs:texture:file = @sky.exr@;}'
+    write_stage(tmp_path, text)
+    package = tmp_path / "packed.usdz"
+    with Sdf.ZipFileWriter.CreateNew(str(package)) as writer:
+        writer.AddFile(str(tmp_path / "stage.usda"), "stage.usda")
+        writer.AddFile(str(tmp_path / "sky.exr"), "sky.exr")
+    code = (
+        "import sys, mitsuba as mi; mi.set_variant('scalar_rgb'); import manylights.usd as usd; "
+        "print(*(note.text for note in usd.load(sys.argv[1]).notes), sep='\\n')"
+    )
+    command = [sys.executable, "-c", code, str(package)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "sky.exr" in done.stdout and "1 time, at /sky" in done.stdout
+
+
 def test_picture_that_is_not_finite(usd, tmp_path):
     pixels = np.ones((4, 8, 3), dtype=np.float32)
     pixels[1, 2] = np.nan

@@ -7,6 +7,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from manylights import progress
 from manylights.cli import main
 from manylights.output import channels, images
 
@@ -180,3 +181,14 @@ def test_bench_measures_a_stage(stage, tmp_path):
     pytest.importorskip("flip_evaluator")
     assert main(command) == 0
     assert (out / "results.json").is_file()
+
+
+@pytest.mark.parametrize("command", ["render", "tree", "convert"])
+@pytest.mark.parametrize("patience", [0.0, 600.0])
+def test_long_loading_has_a_bar(stage, tmp_path, monkeypatch, capsys, command, patience):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what rich takes for a terminal
+    monkeypatch.setattr(progress, "PATIENCE", patience)
+    outputs = {"render": ["--spp", "1", "-o", "out.exr"], "tree": [], "convert": ["out.xml"]}
+    monkeypatch.chdir(tmp_path)
+    assert main([command, str(stage), "--variant", "scalar_rgb", *outputs[command]]) == 0
+    assert ("loading" in capsys.readouterr().err) == (patience == 0.0)

@@ -199,7 +199,7 @@ def test_bare_intensity_needs_the_switch(load):
 
 @pytest.mark.parametrize(
     "kind, expected",
-    [("SphereLight", 3), ("DistantLight", 12), ("RectLight", 3 * np.pi / 4)],
+    [("SphereLight", 3), ("DistantLight", 12), ("RectLight", 3)],
 )
 def test_units_of_blender(load, kind, expected):
     text = f'def {kind} "a" {{;float inputs:intensity = 3;float inputs:angle = 0;}}'
@@ -207,6 +207,23 @@ def test_units_of_blender(load, kind, expected):
     (part,) = (part for name, part in scene.items() if name.startswith("light_"))
     value = part["irradiance"] if kind == "DistantLight" else part["emitter"]["radiance"]
     assert color(value) == pytest.approx([expected] * 3)
+
+
+def test_white_of_blender_is_white(load):
+    """Blender switches the temperature on, and does not write its default."""
+    text = 'def SphereLight "a" {;bool inputs:enableColorTemperature = true;MORE}'
+    for more, units in (("", False), ("float inputs:colorTemperature = 6400;", True)):
+        (part,) = emitters(load(text.replace("MORE", more), blender_light_units=units), "sphere")
+        assert color(part["emitter"]["radiance"])[0] > 1.02
+    (part,) = emitters(load(text.replace("MORE", ""), blender_light_units=True), "sphere")
+    assert color(part["emitter"]["radiance"]) == pytest.approx([1] * 3)
+
+
+def test_sun_of_blender_has_half_of_its_angle(load):
+    text = 'def DistantLight "a" {;float inputs:intensity = 3;float inputs:angle = 5;}'
+    (sun,) = emitters(load(text, blender_light_units=True), "directional")
+    disk = np.pi * np.sin(np.radians(5)) ** 2
+    assert color(sun["irradiance"]) == pytest.approx([12 * disk] * 3)
 
 
 @pytest.mark.parametrize(
@@ -572,6 +589,9 @@ def test_one_note_a_kind(load, attributes, kind, word):
     assert word in text
     assert "3 times" in text and "/light_0" in text
     assert len(emitters(scene, "sphere")) == 3
+    text = note(load(lights[1]), kind)
+    assert word in text
+    assert re.search(r"\b1 time\b", text) and "/light_1" in text
 
 
 @pytest.mark.parametrize("attributes", ["rel light:filters;", "float inputs:diffuse = 1;"])

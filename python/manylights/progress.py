@@ -1,16 +1,20 @@
-"""A progress bar with the estimated time left, and a render that Ctrl-C ends at once."""
+"""Progress bars, with the estimated time left, and a render that Ctrl-C ends at once."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 #: Seconds between two looks at the state of the work.
 REFRESH = 0.1
+
+#: Seconds after which work whose length nobody knows gets a bar.
+PATIENCE = 1.0
 
 #: Exit status of a command that Ctrl-C ended, as shells have it: 128 + SIGINT.
 INTERRUPTED = 130
@@ -64,6 +68,40 @@ def format_seconds(seconds: float | None) -> str:
 def say(text: str) -> None:
     """Print a line on stderr, above the progress bar if there is one."""
     print(text, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def waiting(title: str) -> Iterator[None]:
+    """Context of work of unknown length: above :data:`PATIENCE` a bar on stderr shows the seconds.
+
+    The work stays in its thread, so Ctrl-C works as ever. Without a terminal there is no bar.
+
+    Args:
+        title: what the bar is labelled with.
+    """
+    done = threading.Event()
+    watcher = threading.Thread(target=_show_waiting, args=(title, done), daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        done.set()
+        watcher.join()
+
+
+def _show_waiting(title: str, done: threading.Event) -> None:
+    if done.wait(PATIENCE):
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    silent = not console.is_terminal
+    with Progress(*columns, console=console, disable=silent, transient=True) as bar:
+        task = bar.add_task(title, total=None)
+        bar.tasks[task].start_time -= PATIENCE
+        done.wait()
 
 
 def run_with_bar(

@@ -9,7 +9,7 @@ from manylights import files, loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
 from manylights.loading.parsing import USD_ENDINGS, import_usd
-from manylights.progress import say
+from manylights.progress import say, waiting
 
 HELP = """\
 Writes a USD stage as XML, with its meshes and pictures as files in a folder of the same
@@ -41,10 +41,12 @@ def _run(options) -> None:
     target = files.check_output(options.output, "Mitsuba's scenes are XML files", ".xml")
     usd = import_usd(options.stage)
     loading.set_variant(options.variant)
-    description = usd.describe(options.stage, **asdict(shared.usd_options(options)))
+    with waiting("loading"):
+        description = usd.describe(options.stage, **asdict(shared.usd_options(options)))
     for note in description.notes:
         say(note.text)
     if description.exposure != 1.0:
         say(f"camera: multiply images by its exposure, {description.exposure:g}: XML has none")
-    written = usd.write_xml(description, target)
+    with waiting("writing"):
+        written = usd.write_xml(description, target)
     say(f"wrote {target} and {len(written) - 1} files in {target.with_suffix('')}")

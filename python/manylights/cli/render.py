@@ -11,7 +11,7 @@ from manylights import loading
 from manylights.cli import options as shared
 from manylights.loading import integrators
 from manylights.output import images
-from manylights.progress import run_with_bar, say
+from manylights.progress import run_with_bar, say, waiting
 from manylights.rendering import Job, render
 from manylights.rendering.checkpoint import Checkpoint, path_for
 
@@ -102,7 +102,8 @@ def _run(options) -> None:
         settings["hide_emitters"] = True
     shared.start(options)
     stage = shared.usd_options(options)
-    loaded = loading.load(options.scene, defines, options.integrator, settings, stage)
+    with waiting("loading"):
+        loaded = loading.load(options.scene, defines, options.integrator, settings, stage)
     for note in loaded.notes:
         say(note)
     # What changes the image and is not in a file: a checkpoint of other choices is refused.

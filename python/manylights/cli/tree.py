@@ -6,6 +6,7 @@ import json
 
 from manylights import lights, loading
 from manylights.cli import options as shared
+from manylights.progress import waiting
 
 
 def add(commands, common) -> None:
@@ -21,5 +22,7 @@ def add(commands, common) -> None:
 
 def _run(options) -> None:
     loading.set_variant(options.variant)
-    found = lights.describe(options.scene, shared.defines(options), shared.usd_options(options))
+    defines, stage = shared.defines(options), shared.usd_options(options)
+    with waiting("loading"):
+        found = lights.describe(options.scene, defines, stage)
     print(json.dumps(found) if options.json else lights.format_report(found))

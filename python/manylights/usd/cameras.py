@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
 from manylights.usd.context import Context
-from manylights.usd.settings import Settings
+from manylights.usd.settings import RenderSettings
 from manylights.usd.stage import StageError
 from manylights.usd.traversal import local_matrix
 
@@ -24,7 +24,9 @@ VIEWS = {"Y": (0.45, 0.35, 1.0), "Z": (0.45, -1.0, 0.35)}
 FIELD_OF_VIEW = 45.0
 
 
-def choose_camera(context: Context, wanted: str | None, settings: Settings) -> Usd.Prim | None:
+def choose_camera(
+    context: Context, wanted: str | None, settings: RenderSettings
+) -> Usd.Prim | None:
     """Return the camera to use, None if the stage has none.
 
     Raises:
@@ -66,7 +68,7 @@ def _named(stage: Usd.Stage, path: str, cameras: list[Usd.Prim]) -> Usd.Prim:
     return prim
 
 
-def sensor_of(prim: Usd.Prim, context: Context, settings: Settings) -> tuple[dict, float]:
+def sensor_of(prim: Usd.Prim, context: Context, settings: RenderSettings) -> tuple[dict, float]:
     """Return a camera as a sensor and the factor of its exposure."""
     camera = UsdGeom.Camera(prim)
     values = _Values(camera, context)
@@ -96,7 +98,7 @@ def sensor_of(prim: Usd.Prim, context: Context, settings: Settings) -> tuple[dic
     return sensor, values.exposure()
 
 
-def framing_sensor(context: Context, points: np.ndarray, settings: Settings) -> dict:
+def framing_sensor(context: Context, points: np.ndarray, settings: RenderSettings) -> dict:
     """Return a sensor that shows all points, ``(n, 3)``, and note that it was made up."""
     points = points[np.isfinite(points).all(axis=1)]
     low, high = (
@@ -221,14 +223,14 @@ def _to_world(right, up, back, position):
     return mi.ScalarTransform4f(matrix)
 
 
-def _resolution(settings: Settings, aspect: float) -> tuple[int, int]:
+def _resolution(settings: RenderSettings, aspect: float) -> tuple[int, int]:
     authored = settings.resolution()
     if authored:
         return authored
     return WIDTH, max(1, min(round(WIDTH / aspect), 16 * WIDTH))
 
 
-def _film_and_sampler(width: int, height: int, settings: Settings) -> dict:
+def _film_and_sampler(width: int, height: int, settings: RenderSettings) -> dict:
     film = {
         "type": "hdrfilm",
         "width": width,

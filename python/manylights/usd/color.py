@@ -14,6 +14,23 @@ ACESCG_TO_REC709 = np.array(
 )
 
 
+def lamp_spectrum(texture: dict, peak: float) -> dict:
+    """Return a texture of radiance for spectral variants, of one with values up to 1.
+
+    Those are reflectances there: above 1 they are cut off, and they lack the white of lamps, D65.
+
+    Args:
+        texture: of radiance over ``peak``.
+        peak: the largest radiance.
+    """
+    return {"type": "d65", "nested": texture, "scale": peak}
+
+
+def peak_of(radiance: np.ndarray) -> float:
+    """Return the factor for :func:`lamp_spectrum`: the largest value, never 0."""
+    return max(float(radiance.max()), float(np.finfo(np.float32).tiny))
+
+
 def encoding_of(lookup, pixels: np.ndarray, role: str, path: str, notes) -> str:
     """Return how an image's values are stored: ``"srgb"``, ``"linear"`` or ``"acescg"``.
 

@@ -26,8 +26,8 @@ class Note:
     @property
     def text(self) -> str:
         """The sentence, how often, and the first prim's path."""
-        times = f" ({self.count} times, first at {self.prim})" if self.count > 1 else ""
-        return f"{self.message}{times or f' ({self.prim})'}"
+        times = f"{self.count} times, first at" if self.count > 1 else "1 time, at"
+        return f"{self.message} ({times} {self.prim})"
 
 
 class Notes(list):
@@ -54,7 +54,7 @@ class Context:
         purposes: of the prims that are read.
         subdivision: levels for meshes without an authored scheme; ``None``: the cage.
         legacy_lights: read the inputs of lights from before USD 21.05?
-        blender_light_units: are lights in Blender's units?
+        blender_light_units: are lights as Blender exports them?
     """
 
     stage: Usd.Stage

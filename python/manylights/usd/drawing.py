@@ -26,7 +26,7 @@ MANY_COPIES, BAKED_TRIANGLES = 256, 4_000_000
 CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T.astype(bool)
 
 
-class Drawing:
+class Scenery:
     """Turns the geometry of batches into parts of a description.
 
     Attributes:

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
-from pxr import Ar, Sdf, Usd
+from pxr import Sdf, Usd
 
+from manylights.usd import textures
+from manylights.usd.color import decode, lamp_spectrum, peak_of
 from manylights.usd.context import Context
 from manylights.usd.stage import NAMED_FILES
 
@@ -29,19 +31,17 @@ class Image:
 
     def texture(self, scale, to_uv) -> dict:
         """Return the picture times three factors as a texture of radiance."""
-        return emissive(self.pixels * np.asarray(scale), wrap_mode="clamp", to_uv=to_uv)
-
-
-def emissive(pixels: np.ndarray, **parameters) -> dict:
-    """Return linear pixels as a texture of radiance; ``parameters`` are those of a ``bitmap``.
-
-    Mitsuba's ``bitmap`` has reflectances in spectral variants: above 1 it cuts them off.
-    """
-    spectral = "spectral" in mi.variant()
-    peak = max(float(pixels.max()), np.finfo(np.float32).tiny) if spectral else 1.0
-    bitmap = mi.Bitmap((pixels / peak).astype(np.float32))
-    texture = {"type": "bitmap", "bitmap": bitmap, "raw": not spectral, **parameters}
-    return {"type": "d65", "nested": texture, "scale": peak} if spectral else texture
+        pixels = self.pixels * np.asarray(scale)
+        spectral = "spectral" in mi.variant()
+        peak = peak_of(pixels) if spectral else 1.0
+        texture = {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap((pixels / peak).astype(np.float32)),
+            "raw": not spectral,
+            "wrap_mode": "clamp",
+            "to_uv": to_uv,
+        }
+        return lamp_spectrum(texture, peak) if spectral else texture
 
 
 def read_image(asset: Sdf.AssetPath, prim: Usd.Prim, context: Context) -> Image | None:
@@ -54,7 +54,7 @@ def read_image(asset: Sdf.AssetPath, prim: Usd.Prim, context: Context) -> Image 
         inner = path.rstrip("]").lower()
         if not inner.endswith(EXTENSIONS):
             raise ValueError(f"is none of {', '.join(EXTENSIONS)}")
-        pixels = _linear(_bitmap(path))
+        pixels = _linear(textures.read_image(path))
         if not np.isfinite(pixels).all():
             raise ValueError("has values that are not finite")
         return Image(pixels, path)
@@ -67,26 +67,12 @@ def read_image(asset: Sdf.AssetPath, prim: Usd.Prim, context: Context) -> Image 
         return None
 
 
-def _bitmap(path: str) -> mi.Bitmap:
-    if "[" not in path:
-        return mi.Bitmap(path)
-    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path))
-    if not asset:
-        raise ValueError("is not in its archive")
-    with asset:
-        data = bytes(asset.GetBuffer())
-    stream = mi.MemoryStream()
-    stream.write(data)
-    stream.seek(0)
-    return mi.Bitmap(stream)
-
-
-def _linear(bitmap: mi.Bitmap) -> np.ndarray:
+def _linear(pixels: np.ndarray | None) -> np.ndarray:
     """Return three linear channels; only pictures of 8 bits are in sRGB."""
-    if bitmap.component_format() not in (mi.Struct.Type.UInt8, mi.Struct.Type.Int8):
-        bitmap.set_srgb_gamma(False)
-    bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
-    pixels = np.array(bitmap, copy=True)
+    if pixels is None:
+        raise ValueError("is not in its archive")
     if pixels.size == 0:
         raise ValueError("is empty")
-    return pixels
+    encoding = "srgb" if pixels.dtype == np.uint8 else "linear"
+    pixels = textures.with_channels(np.atleast_3d(pixels))
+    return np.ascontiguousarray(decode(pixels, encoding)[..., :3])

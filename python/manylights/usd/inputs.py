@@ -37,9 +37,12 @@ FALLBACKS = {
 #: Those of some types.
 TYPED_FALLBACKS = {("DistantLight", "intensity"): 50000.0}
 
-#: What Cycles shines with, over what Blender's export means: that writes power over pi, for the sun
-#: a quarter of its irradiance. Area lights of Cycles have a radiance of power over 4 areas.
-BLENDER_FACTORS = {"DistantLight": 4.0, "RectLight": math.pi / 4, "DiskLight": math.pi / 4}
+#: Blender writes suns with a quarter of their irradiance and half of their angle, other lights
+#: right but for their white (``scenes/bench/blender_units.py``).
+BLENDER_SUN = {"intensity": 4.0, "angle": 2.0}
+
+#: It switches the color temperature of all lights on; this one is its default, and white.
+BLENDER_WHITE = 6500.0
 
 #: Before USD 21.05 inputs of lights had no ``inputs:``.
 LEGACY = tuple(name for name in FALLBACKS if name not in ("diffuse", "specular", "shadow:enable"))
@@ -108,12 +111,13 @@ class LightInputs:
             scale = float(self.get("intensity")) * 2.0 ** float(self.get("exposure"))
         except OverflowError:
             scale = math.inf
-        if self.context.blender_light_units:
-            scale *= BLENDER_FACTORS.get(str(self.prim.GetTypeName()), 1.0)
+        if self._is_blender_sun():
+            scale *= BLENDER_SUN["intensity"]
         color = np.array(self.get("color"), dtype=np.float64) * scale
         if self.get("enableColorTemperature"):
             kelvin = float(self.get("colorTemperature"))
-            color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
+            if not (self.context.blender_light_units and kelvin == BLENDER_WHITE):
+                color = color * np.array(UsdLux.BlackbodyTemperatureAsRgb(kelvin))
         if not np.isfinite(color).all():
             text = "a light whose intensity, exposure or color is not finite was left out"
             self.context.notes.add("light value", text, self.prim)
@@ -122,6 +126,14 @@ class LightInputs:
             text = "negative light is not possible, it was cut off at zero"
             self.context.notes.add("negative", text, self.prim)
         return np.maximum(color, 0.0)
+
+    def angle(self) -> float:
+        """Return the angle of a distant light's disk in degrees."""
+        factor = BLENDER_SUN["angle"] if self._is_blender_sun() else 1.0
+        return float(self.get("angle")) * factor
+
+    def _is_blender_sun(self) -> bool:
+        return self.context.blender_light_units and self.prim.GetTypeName() == "DistantLight"
 
     def length(self, name: str) -> float:
         """Return a radius or an extent, 0 and a note if it is none."""

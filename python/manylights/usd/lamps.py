@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from manylights.usd.color import lamp_spectrum, peak_of
 from manylights.usd.description import MeshShape, copied_faces, transformed, triangle_areas
 
 #: Radiances that become a mesh each, which every integrator can sample. More become one mesh with
@@ -99,10 +100,9 @@ def _with_attribute(positions, faces, radiance: np.ndarray, bsdf) -> MeshShape:
     """Return a mesh with a radiance, ``(m, 3)``, for each face."""
     texture = {"type": "mesh_attribute", "name": "face_color"}
     if "spectral" in mi.variant():
-        # An attribute is a reflectance there: up to 1, and without the white of lamps
-        peak = max(float(radiance.max()), np.finfo(np.float32).tiny)
+        peak = peak_of(radiance)
         radiance = radiance / np.float32(peak)
-        texture = {"type": "d65", "nested": texture, "scale": peak}
+        texture = lamp_spectrum(texture, peak)
     attributes = {"face_color": radiance}
     return MeshShape(positions, faces, bsdf=bsdf, attributes=attributes, radiance=texture)
 

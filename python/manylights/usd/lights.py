@@ -123,7 +123,7 @@ class Lights:
         self._area_light("cylinder", inputs, radiance, matrices)
 
     def _distant(self, inputs: LightInputs, radiance, matrices) -> None:
-        angle = float(inputs.get("angle"))
+        angle = inputs.angle()
         half = np.clip(np.radians(angle) / 2, 0.0, np.pi)
         sine = np.sin(half) ** 2
         area = np.pi * sine if half <= np.pi / 2 else np.pi * (2 - sine)

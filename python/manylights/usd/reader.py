@@ -9,9 +9,9 @@ from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
 from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
 from manylights.usd.description import instantiate
-from manylights.usd.drawing import Drawing
+from manylights.usd.drawing import Scenery
 from manylights.usd.lights import Lights
-from manylights.usd.settings import Settings
+from manylights.usd.settings import RenderSettings
 from manylights.usd.stage import StageError, guarded, layer_files, open_stage, time_of
 from manylights.usd.traversal import collect
 
@@ -71,7 +71,8 @@ def load(
             cages are used.
         default_light: shine from everywhere, with radiance 1, if the stage has no light?
         legacy_lights: read the inputs of lights from before USD 21.05, without ``inputs:``?
-        blender_light_units: are lights in the units in which Blender exports them?
+        blender_light_units: are lights as Blender (5.0) exports them: suns with a quarter of their
+            irradiance and half of their angle, and all with a color temperature, 6500 for white?
 
     Returns:
         A dictionary with objects of the current variant of Mitsuba, and the attribute ``notes``.
@@ -137,7 +138,7 @@ def _purposes(purposes) -> tuple[str, ...]:
 def _read(context: Context, camera, default_light: bool) -> SceneDict:
     batches = collect(context)
     lights = Lights(context)
-    drawing = Drawing(context, lights, batches)
+    drawing = Scenery(context, lights, batches)
     for batch in batches:
         for item in batch.items:
             if item.role == "light":
@@ -146,12 +147,12 @@ def _read(context: Context, camera, default_light: bool) -> SceneDict:
     return _scene(context, lights, drawing, camera, default_light)
 
 
-def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_light) -> SceneDict:
+def _scene(context: Context, lights: Lights, drawing: Scenery, camera, default_light) -> SceneDict:
     geometry = drawing.points()
     points = np.concatenate([geometry, lights.points()])
     points = points[np.isfinite(points).all(axis=1)]
     lights.finish(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0)
-    settings = Settings(context)
+    settings = RenderSettings(context)
     scene = SceneDict(type="scene")
     _add_sensor(scene, context, settings, camera, geometry if len(geometry) else points)
     scene.update(lights.entries)
@@ -169,7 +170,9 @@ def _scene(context: Context, lights: Lights, drawing: Drawing, camera, default_l
     return scene
 
 
-def _add_sensor(scene: SceneDict, context: Context, settings: Settings, camera, points) -> None:
+def _add_sensor(
+    scene: SceneDict, context: Context, settings: RenderSettings, camera, points
+) -> None:
     prim = cameras.choose_camera(context, camera, settings)
     scene.exposure, scene.camera = 1.0, None if prim is None else str(prim.GetPath())
     try:
@@ -185,7 +188,7 @@ def _add_sensor(scene: SceneDict, context: Context, settings: Settings, camera, 
         raise StageError(text) from None
 
 
-def _integrator(context: Context, settings: Settings, uses_attribute: bool) -> dict:
+def _integrator(context: Context, settings: RenderSettings, uses_attribute: bool) -> dict:
     """Return the integrator that the stage asks for, one of ours where only ours see the lamps."""
     asked = settings.integrator()
     if asked is None:

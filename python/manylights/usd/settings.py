@@ -15,7 +15,7 @@ LARGEST_SIDE = 65536
 FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
 
 
-class Settings:
+class RenderSettings:
     """The render settings to use, perhaps none.
 
     Attributes:

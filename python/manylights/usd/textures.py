@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from pxr import Ar, UsdShade
 
-from manylights.usd.color import decode, encoding_of
+from manylights.usd.color import decode, encoding_of, lamp_spectrum, peak_of
 from manylights.usd.shading import Lookup, file_path
 
 MOST_PIXELS = 1 << 28
@@ -73,7 +73,7 @@ class Textures:
             notes.add("normal map", text, lookup.node.GetPath())
             lookup.scale, lookup.bias = np.full(4, 2.0), np.full(4, -1.0)
         encoding = encoding_of(lookup, pixels, role, path, notes)
-        pixels = _with_channels(pixels)
+        pixels = with_channels(pixels)
         plain = _is_unscaled(lookup) and role != "normal" and lookup.threshold <= 0
         if plain and channel == "rgb" and pixels.dtype == np.uint8 and encoding != "acescg":
             image, gamma = pixels[..., :3], encoding == "srgb"
@@ -141,7 +141,7 @@ class Textures:
         kind = next(iter(tiles.values())).dtype
         atlas = np.zeros((rows * height, columns * width, 4), dtype=kind)
         for (u, v), tile in tiles.items():
-            tile = _with_channels(tile)
+            tile = with_channels(tile)
             y = (np.arange(height) + 0.5) * tile.shape[0] // height
             x = (np.arange(width) + 0.5) * tile.shape[1] // width
             top, left = (rows - 1 - (v - first[1])) * height, (u - first[0]) * width
@@ -168,8 +168,7 @@ def _dictionary(lookup: Lookup, image: np.ndarray, gamma: bool, role: str) -> di
         matrix = np.array([[width, 0, 1], [0, height, 1], [0, 0, 1]]) @ matrix
         matrix = np.diag([1 / (width + 2), 1 / (height + 2), 1]) @ matrix
     in_spectra = role == "emission" and "spectral" in (mi.variant() or "")
-    # Spectra of colors reach up to 1, and have the white of lamps only below D65
-    peak = max(float(image.max()), 1e-6) if in_spectra and image.dtype != np.uint8 else 1.0
+    peak = peak_of(image) if in_spectra and image.dtype != np.uint8 else 1.0
     bitmap = mi.Bitmap(image if peak == 1 else image / np.float32(peak))
     bitmap.set_srgb_gamma(gamma)
     texture = {"type": "bitmap", "bitmap": bitmap, "wrap_mode": wrap}
@@ -180,7 +179,7 @@ def _dictionary(lookup: Lookup, image: np.ndarray, gamma: bool, role: str) -> di
     matrix = FLIP @ matrix @ FLIP
     if not np.allclose(matrix, np.eye(3)):
         texture["to_uv"] = mi.ScalarTransform3f(matrix)
-    return {"type": "d65", "nested": texture, "scale": peak} if in_spectra else texture
+    return lamp_spectrum(texture, peak) if in_spectra else texture
 
 
 def scaled(radiance: dict, factor) -> dict:
@@ -201,7 +200,7 @@ def scaled(radiance: dict, factor) -> dict:
     if radiance["type"] != "bitmap":
         return radiance
     old = radiance["bitmap"]
-    pixels = _with_channels(np.atleast_3d(np.array(old)))
+    pixels = with_channels(np.atleast_3d(np.array(old)))
     pixels = decode(pixels, "srgb" if old.srgb_gamma() else "linear")[..., :3] * three
     bitmap = mi.Bitmap(np.ascontiguousarray(pixels, dtype=np.float32))
     bitmap.set_srgb_gamma(False)
@@ -235,7 +234,10 @@ def read_image(path: str) -> np.ndarray | None:
         file = os.path.join(folder, os.path.basename(path).rstrip("]"))
         with open(file, "wb") as copy:
             copy.write(asset.GetBuffer())
-        return read_image(file)
+        try:
+            return read_image(file)
+        except RuntimeError as error:
+            raise RuntimeError(str(error).replace(file, path)) from None
 
 
 def check_size(width: int, height: int) -> None:
@@ -257,7 +259,7 @@ def _at_least_two(pixels: np.ndarray) -> np.ndarray:
     return np.tile(pixels, (*times, 1)) if max(times) > 1 else pixels
 
 
-def _with_channels(pixels: np.ndarray) -> np.ndarray:
+def with_channels(pixels: np.ndarray) -> np.ndarray:
     """Return four channels: grey ones repeated, with an opaque alpha where there is none."""
     channels = pixels.shape[2]
     if channels == 4:
@@ -270,7 +272,7 @@ def _with_channels(pixels: np.ndarray) -> np.ndarray:
 
 def _luminance(image: np.ndarray, gamma: bool) -> np.ndarray:
     """Return one channel of three, for inputs that want a number."""
-    values = decode(_with_channels(image), "srgb" if gamma else "linear")[..., :3]
+    values = decode(with_channels(image), "srgb" if gamma else "linear")[..., :3]
     return (values @ [0.2126, 0.7152, 0.0722]).astype(np.float32)[..., None]
 
 
