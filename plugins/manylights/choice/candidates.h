@@ -3,7 +3,7 @@
 /**
  * Candidates: the N' lights that a shading point considers, one after the other.
  *
- * Three sources with one interface, used by the loops in direct_light.h:
+ * Three sources with one interface, used by the loops in kept_lights.h and shadow_rays.h:
  *
  *     Mask has_next() const;                 is there another candidate?
  *     Candidate next(tree, receiver, rng);   find it and move on

@@ -14,17 +14,9 @@
 
 #include "manylights/direct/direct_light.h"
 #include "manylights/scene/hidden_emitters.h"
+#include "scattering.h"
 
 namespace manylights {
-
-/// Parameters of the paths, as Mitsuba's
-struct PathLimits {
-    uint32_t max_depth, rr_depth;
-    bool hide_emitters;
-};
-
-/// `max_depth` of paths that only roulette ends
-constexpr uint32_t kUnlimited = (uint32_t) -1;
 
 template <typename Float, typename Spectrum> class PathTracer {
 public:
@@ -33,15 +25,18 @@ public:
     using Lights      = SceneLights<Float, Spectrum>;
     using Vertex      = manylights::Vertex<Float, Spectrum>;
     using InMedium    = manylights::InMedium<Float, Spectrum>;
-    using Media       = manylights::Media<Float, Spectrum>;
+    using State       = PathState<Float, Spectrum>;
+    using Piece       = manylights::Piece<Float, Spectrum>;
+    using Direction   = manylights::Direction<Float, Spectrum>;
     using FloatD      = dr::detached_t<Float>;
 
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
                const SamplingParameters &params, const PathLimits &limits)
         : m_scene(scene), m_direct(scene, lights, params, media), m_limits(limits),
-          m_media(media.any), m_homogeneous(media.homogeneous),
-          m_segments(media.homogeneous && media.scattering),
-          m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr) {}
+          m_media(media.any), m_segments(media.homogeneous && media.scattering),
+          m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr),
+          m_flights(m_direct.media(), m_limits, m_segments),
+          m_scattering(m_limits, m_segments) {}
 
     /// Radiance along a ray from the camera, and whether it met anything
     std::pair<Spectrum, Mask> trace(Sampler *sampler, const Ray3f &ray,
@@ -64,43 +59,21 @@ public:
     }
 
 private:
-    struct State {
-        Mask active, valid;
-        UInt32 depth;
-        Ray3f ray;
-        PreliminaryIntersection3f pi;
-        MediumPtr medium;
-        Spectrum throughput, result;
-        Float eta;
-        /// The vertex before, for the density of finding its lights by chance
-        Receiver<FloatD> from;
-        Float u_tree, pdf;
-        /// Did the path leave it by a direction that light sampling cannot find?
-        Mask specular;
-        Counts<Float> counts;
-        Sampler *sampler;
-        DRJIT_STRUCT(State, active, valid, depth, ray, pi, medium, throughput, result,
-                     eta, from, u_tree, pdf, specular, counts, sampler)
-
-        State(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
-            : active(active), valid(false), depth(0), ray(ray), medium(medium),
-              throughput(1.f), result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()),
-              u_tree(0.f), pdf(1.f), specular(true), sampler(sampler) {}
-    };
-
-    /// Where a path goes on
-    struct Direction {
-        Ray3f ray;
-        Spectrum weight;
-        Float pdf, eta;
-        Mask specular, null;
-    };
-
+    /**
+     * One piece of a path and the vertex at its end:
+     *
+     *     case               shows the light of         factor of it          goes on from
+     *     no medium          the surface                1                     the surface
+     *     flew through       the surface                flight weight         the surface
+     *     point in medium    the point                  flight weight         the point
+     *     on a segment       segment; surface behind    its own; exp(-s t)    surface or point
+     *
+     * A segment's light does not depend on how its flight ended; the path goes on from there.
+     */
     void step(State &s) const {
         Piece piece;
         if (m_media)
-            fly(s, piece);
-        // A segment's light is done, whatever the flight: so the surface behind is seen, too
+            m_flights.fly(s, piece);
         Mask surface = s.active && (!piece.scattered || piece.segment);
         SurfaceInteraction3f si =
             s.pi.compute_surface_interaction(s.ray, +mitsuba::RayFlags::All, surface);
@@ -114,8 +87,8 @@ private:
         Mask ends_there = surface && !piece.scattered;
 
         BSDFPtr bsdf = bsdf_of(si, surface);
-        Mask goes_on =
-            ends_there && (!is_last(s) || can_pass(bsdf, ends_there) || piece.hidden);
+        Mask goes_on = ends_there && (!m_limits.is_last(s.depth) ||
+                                      can_pass(bsdf, ends_there) || piece.hidden);
         s.valid |= ends_there && !goes_on;
         s.active &= piece.scattered || goes_on;
         if (dr::none_or<false>(s.active))
@@ -131,75 +104,6 @@ private:
         intersect(s, /* coherent = */ false);
         if (m_media)
             start_at(s, si.p, !piece.scattered);
-    }
-
-    // --------------------------------------------------------------------- Medium event
-
-    /// What became of a piece of the path
-    struct Piece {
-        /// The medium, where the path is in one; `here` if its vertex is a point in it
-        InMedium inside;
-        /// Was it scattered before it reached the surface?
-        Mask scattered = false;
-        /// Is single scattering estimated along all of it? Factor of the light of its vertex
-        Mask segment             = false;
-        UnpolarizedSpectrum seen = 1.f;
-        /// Factor of the path that goes on
-        UnpolarizedSpectrum weight = 1.f;
-        /// Does it end on an emitter that the camera does not see, but what is behind it?
-        Mask hidden = false;
-        /// The segment as the tree sees it, and its random number
-        Receiver<FloatD> along;
-        Float u_tree;
-    };
-
-    /// Move through the medium that the path is in
-    MI_NOINLINE void fly(State &s, Piece &piece) const {
-        InMedium &inside = piece.inside;
-        inside      = { s.medium, dr::zeros<MediumInteraction3f>(), false, s.ray.o, 0.f };
-        piece.along = dr::zeros<Receiver<FloatD>>();
-        piece.u_tree = 0.f;
-        Mask within  = s.active && s.medium != nullptr;
-        if (dr::any_or<true>(within)) {
-            auto flight =
-                m_direct.media().fly(s.medium, s.ray, s.pi.t, s.sampler, within);
-            inside.mei      = flight.mei;
-            piece.scattered = within && flight.scattered && !is_last(s);
-            piece.weight    = dr::select(within, flight.weight, 1.f);
-            Mask exact      = within && passes_exactly(s, within);
-            s.active &= !(flight.scattered && within) || piece.scattered || exact;
-            if (m_homogeneous)
-                take_exact(s, piece, exact);
-            s.valid |= piece.scattered;
-            piece.seen = piece.weight;
-            if (m_segments)
-                find_segment(s, piece, within);
-            inside.here = piece.scattered && !piece.segment;
-        }
-        inside.mei.time        = s.ray.time;
-        inside.mei.wavelengths = s.ray.wavelengths;
-    }
-
-    /// Where nothing that is scattered counts, what goes on has the known transmittance, and
-    /// not that of a flight which may end
-    Mask passes_exactly(const State &s, Mask within) const {
-        if (!m_homogeneous || (m_segments && m_limits.max_depth == kUnlimited))
-            return false;
-        Mask exact = within && s.medium->is_homogeneous();
-        return m_segments ? Mask(exact && is_last(s)) : exact;
-    }
-
-    void take_exact(const State &s, Piece &piece, Mask exact) const {
-        piece.scattered &= !exact;
-        dr::masked(piece.weight, exact) = Media::transmittance(piece.inside.mei, s.pi.t);
-    }
-
-    /// Is this a piece whose single scattering is estimated as a whole?
-    void find_segment(const State &s, Piece &piece, Mask within) const {
-        piece.segment = within && s.medium->is_homogeneous() &&
-                        s.medium->use_emitter_sampling() && !is_last(s) && s.pi.t > 0.f;
-        dr::masked(piece.seen, piece.segment) =
-            Media::transmittance(piece.inside.mei, s.pi.t);
     }
 
     // ------------------------------------------------------------------- Light of a vertex
@@ -251,7 +155,7 @@ private:
                           Mask surface) const {
         Mask lit = vertex.is_lit_surface(surface);
         if (m_media) {
-            lit &= !is_last(s) && dr::any(piece.seen != 0.f);
+            lit &= !m_limits.is_last(s.depth) && dr::any(piece.seen != 0.f);
             Mask here = s.active && vertex.inside->here;
             if (dr::any_or<true>(here))
                 lit |= here && vertex.inside->medium->use_emitter_sampling();
@@ -275,8 +179,8 @@ private:
         Float u1       = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
         Mask surface   = s.active && !piece.scattered;
-        Direction next = m_media ? sample_either(s, vertex, piece, u1, u2)
-                                 : sample_bsdf(vertex, u1, u2, surface);
+        Direction next = m_media ? m_scattering.sample_either(s, vertex, piece, u1, u2)
+                                 : m_scattering.sample_bsdf(vertex, u1, u2, surface);
 
         s.throughput *= next.weight;
         if (m_media)
@@ -302,26 +206,6 @@ private:
         s.pi.t += lead;
     }
 
-    /// A direction from the BSDF or the phase function, whichever a lane has come to
-    MI_NOINLINE Direction sample_either(const State &s, const Vertex &vertex,
-                                        const Piece &piece, const Float &u1,
-                                        const Point2f &u2) const {
-        Direction next = dr::zeros<Direction>();
-        Mask surface   = s.active && !piece.scattered;
-        if (dr::any_or<true>(surface))
-            next = sample_bsdf(vertex, u1, u2, surface);
-        if (m_limits.hide_emitters) {
-            next.null |= piece.hidden;
-            dr::masked(next.ray, piece.hidden)    = vertex.si.spawn_ray(s.ray.d);
-            dr::masked(next.weight, piece.hidden) = Spectrum(1.f);
-            dr::masked(next.eta, piece.hidden)    = 1.f;
-        }
-        Mask scattered = s.active && piece.scattered;
-        if (dr::any_or<true>(scattered))
-            next = merge(next, sample_phase(s, piece, u1, u2, scattered), scattered);
-        return next;
-    }
-
     /// What the density of finding a light by chance needs of the vertex that a path leaves
     void remember(State &s, const Vertex &vertex, const Piece &piece,
                   const Direction &next, Mask leaves) const {
@@ -342,63 +226,7 @@ private:
         s.from.traits() = traits;
     }
 
-    Direction sample_bsdf(const Vertex &vertex, const Float &u1, const Point2f &u2,
-                          Mask active) const {
-        const SurfaceInteraction3f &si = vertex.si;
-        mitsuba::BSDFContext ctx;
-        auto [bs, weight] = vertex.bsdf->sample(ctx, si, u1, u2, active);
-        weight            = si.to_world_mueller(weight, -bs.wo, si.wi);
-        Ray3f ray         = si.spawn_ray(si.to_world(bs.wo));
-        if (dr::grad_enabled(ray)) {
-            // Directions are not differentiated: evaluate again what depends on them
-            ray                           = dr::detach<true>(ray);
-            Vector3f wo                   = si.to_local(ray.d);
-            auto [value, pdf]             = vertex.bsdf->eval_pdf(ctx, si, wo, active);
-            value                         = si.to_world_mueller(value, -wo, si.wi);
-            dr::masked(weight, pdf > 0.f) = value / dr::detach(pdf);
-        }
-        return { ray,
-                 weight & active,
-                 bs.pdf,
-                 bs.eta,
-                 has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta),
-                 has_flag(bs.sampled_type, mitsuba::BSDFFlags::Null) };
-    }
-
-    Direction sample_phase(const State &s, const Piece &piece, const Float &u1,
-                           const Point2f &u2, Mask active) const {
-        const MediumInteraction3f &mei = piece.inside.mei;
-        mitsuba::PhaseFunctionContext<Float, Spectrum> ctx(s.sampler);
-        auto phase             = phase_of(mei, active);
-        auto [wo, weight, pdf] = phase->sample(ctx, mei, u1, u2, active);
-        Ray3f ray              = mei.spawn_ray(wo);
-        if (dr::grad_enabled(ray)) {
-            ray                = dr::detach<true>(ray);
-            auto [value, pdf2] = phase->eval_pdf(ctx, mei, ray.d, active);
-            weight             = value / dr::detach(pdf2);
-        }
-        if (m_segments) { // a density of distance and direction, as that of light sampling
-            const UnpolarizedSpectrum &sigma = mei.combined_extinction;
-            Float density                    = dr::mean(sigma * dr::exp(-mei.t * sigma));
-            dr::masked(pdf, piece.segment)   = pdf * density;
-        }
-        return { ray,        weight & (active && pdf > 0.f),      pdf,
-                 Float(1.f), !mei.medium->use_emitter_sampling(), Mask(false) };
-    }
-
-    static Direction merge(const Direction &a, const Direction &b, Mask use_b) {
-        return { dr::select(use_b, b.ray, a.ray),
-                 dr::select(use_b, b.weight, a.weight),
-                 dr::select(use_b, b.pdf, a.pdf),
-                 dr::select(use_b, b.eta, a.eta),
-                 dr::select(use_b, b.specular, a.specular),
-                 dr::select(use_b, b.null, a.null) };
-    }
-
     // --------------------------------------------------------------------------- Ending
-
-    /// Is this the last vertex that counts? Nothing can be scattered there any more.
-    Mask is_last(const State &s) const { return s.depth + 1u >= m_limits.max_depth; }
 
     /// Can a path that may not scatter any more go straight on through a surface?
     Mask can_pass(const BSDFPtr &bsdf, Mask surface) const {
@@ -439,9 +267,11 @@ private:
     const Scene *m_scene;
     DirectLight m_direct;
     PathLimits m_limits;
-    /// Are there media, homogeneous ones, and those whose single scattering is estimated along
-    /// whole segments? Can a path find light by chance?
-    bool m_media, m_homogeneous, m_segments, m_sees_lights;
+    /// Are there media, and those whose single scattering is estimated along whole segments?
+    /// Can a path find light by chance?
+    bool m_media, m_segments, m_sees_lights;
+    Flights<Float, Spectrum> m_flights;
+    Scattering<Float, Spectrum> m_scattering;
 };
 
 } // namespace manylights

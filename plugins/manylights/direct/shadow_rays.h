@@ -1,0 +1,222 @@
+#pragma once
+
+/**
+ * Stage 3: shadow rays, to all candidates or to s of the kept lights, chosen by
+ * threshold-systematic sampling with target |C F|. (The talk draws s reservoirs; here the
+ * items of large target are taken for sure, the rest at equidistant points.)
+ *
+ * Estimate = sum over the chosen of V C F max(1, tau / g), g the target, tau the step.
+ */
+
+#include "kept_lights.h"
+#include "manylights/learning/visibility.h"
+#include "manylights/scene/media.h"
+
+namespace manylights {
+
+template <typename Float, typename Spectrum> class ShadowRays {
+public:
+    MI_IMPORT_TYPES(Scene)
+    using Lights          = SceneLights<Float, Spectrum>;
+    using Media           = manylights::Media<Float, Spectrum>;
+    using Samples         = LightSamples<Float, Spectrum>;
+    using Sample          = typename Samples::Sample;
+    using InfiniteSamples = typename Samples::InfiniteSamples;
+    using Reader          = typename Samples::Reader;
+    using Vertex          = typename Samples::Vertex;
+    using Kept            = manylights::Kept<Float, Spectrum>;
+    using FloatD          = typename Lights::FloatD;
+    using UInt32D         = typename Lights::UInt32D;
+    using MaskD           = typename Lights::MaskD;
+    using Rng             = VertexRng<FloatD>;
+
+    ShadowRays(const Scene *scene, const Lights &lights, const Media &media,
+               const Strategy &strategy, const Samples &samples)
+        : m_scene(scene), m_lights(lights), m_media(media), m_strategy(strategy),
+          m_samples(samples) {}
+
+    /// A shadow ray for each kept light, or for some of them
+    MI_NOINLINE Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
+        InfiniteSamples infinite = m_samples.sample_infinite(vertex, active);
+        FloatD offset            = plain(vertex.u.selection);
+        FloatD tau(0.f);
+        if (m_strategy.chooses) {
+            for (size_t i = 0; i < m_strategy.infinite; ++i)
+                kept.target[m_strategy.slots + i] =
+                    m_samples.target(infinite[i].unoccluded());
+            tau = selection_threshold<FloatD>(kept.target, m_strategy.items,
+                                              m_strategy.params.shadow_rays,
+                                              FloatD(vertex.effort.shadow_rays));
+        }
+
+        struct State {
+            UInt32D ray;
+            Spectrum result;
+            Rng rng;
+            DRJIT_STRUCT(State, ray, result, rng)
+        };
+        State state{ UInt32D(0), Spectrum(0.f), media_rng(vertex) };
+        UInt32D rays = dr::minimum(vertex.effort.shadow_rays, m_strategy.items);
+        MaskD on     = plain(active);
+        loop(
+            state, [&](const State &s) { return on && s.ray < rays; },
+            [&](State &s) {
+                Selected<FloatD> chosen{ s.ray, FloatD(1.f), MaskD(true) };
+                FloatD boost(1.f);
+                if (m_strategy.chooses) {
+                    chosen = select_item<FloatD>(kept.target, m_strategy.items, tau,
+                                                 (FloatD(s.ray) + offset) * tau);
+                    boost  = dr::maximum(1.f, tau / chosen.target);
+                }
+                s.result +=
+                    trace(vertex, kept, infinite, chosen, s.rng, active) * Float(boost);
+                s.ray += 1u;
+            },
+            "Direct light: shadow rays");
+        return state.result;
+    }
+
+    /// No resampling, a shadow ray for every candidate: few lights, or the method
+    /// `adaptive_splitting`
+    Spectrum trace_candidates(const Vertex &vertex, Counts<Float> &counts,
+                              Mask active) const {
+        Spectrum result(0.f);
+        Rng rng = m_strategy.source == Source::AllLights
+                      ? media_rng(vertex)
+                      : make_rng(plain_sample(vertex.u));
+        if (m_strategy.slots > 0)
+            m_strategy.with_source<FloatD>([&](const auto &source) {
+                using Source = std::decay_t<decltype(source)>;
+                // No method traces all of these: not compiled
+                if constexpr (!std::is_same_v<Source, SystematicSource<FloatD>>)
+                    result = trace_candidates(
+                        vertex,
+                        source.cursor(m_lights.tree(), vertex, plain(vertex.u.tree)), rng,
+                        counts, active);
+            });
+        if (m_strategy.infinite == 0)
+            return result;
+        InfiniteSamples infinite = m_samples.sample_infinite(vertex, active);
+        for (size_t i = 0; i < m_strategy.infinite; ++i)
+            result += trace_sample(vertex, infinite[i], rng, active);
+        return result;
+    }
+
+private:
+    template <typename Cursor>
+    Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor, Rng &rng,
+                              Counts<Float> &counts, Mask active) const {
+        struct State {
+            Cursor cursor;
+            UInt32D slot;
+            Spectrum result;
+            Rng rng;
+            DRJIT_STRUCT(State, cursor, slot, result, rng)
+            State(const Cursor &cursor, Rng &&rng)
+                : cursor(cursor), slot(0), result(0.f), rng(std::move(rng)) {}
+        };
+        State state(cursor, std::move(rng));
+        MaskD on = plain(active);
+        loop(
+            state, [&](const State &s) { return on && s.cursor.has_next(); },
+            [&](State &s) {
+                auto candidate = s.cursor.next(m_lights.tree(), vertex.at, s.rng);
+                FloatD p       = candidate.probability;
+                Mask valid     = active && candidate.valid;
+                Sample sample  = m_samples.sample(vertex, candidate.light, p, s.slot,
+                                                  /* target_only = */ false, valid);
+                sample.value *= Float(dr::rcp(p));
+                s.result += trace_sample(vertex, sample, s.rng, valid);
+                s.slot += 1u;
+            },
+            "Direct light: rays to all candidates");
+        counts.add(state.slot, state.cursor.visits, active);
+        rng = std::move(state.rng);
+        return state.result;
+    }
+
+    /// The chosen item's contribution, with visibility
+    Spectrum trace(const Vertex &vertex, const Kept &kept,
+                   const InfiniteSamples &infinite, const Selected<FloatD> &chosen,
+                   Rng &rng, Mask active) const {
+        active &= chosen.valid;
+        Sample sample = dr::zeros<Sample>();
+        if (m_strategy.slots > 0) {
+            UInt32D slot  = dr::minimum(chosen.item, m_strategy.slots - 1u);
+            FloatD weight = read_slot<FloatD>(kept.weight, slot, m_strategy.slots);
+            Mask finite   = active && chosen.item < m_strategy.slots && weight > 0.f;
+            sample        = kept_sample(vertex, kept, slot, finite);
+            sample.value  = sample.value * Float(weight) & finite;
+        }
+        for (size_t i = 0; i < m_strategy.infinite; ++i)
+            sample =
+                dr::select(active && chosen.item == (uint32_t) (m_strategy.slots + i),
+                           infinite[i], sample);
+
+        Spectrum result = trace_sample(vertex, sample, rng, active);
+        if (m_lights.tree().visibility) {
+            // Far from the smallest floats, which some threads round to zero
+            constexpr float least = 1e-30f;
+            MaskD traced          = plain(active) && chosen.item < m_strategy.slots &&
+                                    m_samples.target(sample.unoccluded()) > least;
+            UInt32D slot          = dr::minimum(chosen.item, m_strategy.slots - 1u);
+            count_ray(m_lights.tree(), vertex.at.cell,
+                      read_slot<UInt32D>(kept.light, slot, m_strategy.slots),
+                      m_samples.target(result) > least, traced);
+        }
+        return result;
+    }
+
+    /// F / p of what is in a slot
+    Sample kept_sample(const Vertex &vertex, const Kept &kept, const UInt32D &slot,
+                       Mask active) const {
+        if constexpr (!dr::is_jit_v<Float>)
+            if (m_strategy.keeps_samples)
+                return kept.sample[slot];
+        return m_samples.sample(
+            vertex, read_slot<UInt32D>(kept.light, slot, m_strategy.slots),
+            read_slot<FloatD>(kept.probability, slot, m_strategy.slots), slot,
+            /* target_only = */ false, active);
+    }
+
+    Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,
+                          Mask active) const {
+        // Drops invalid values as well
+        active &= Mask(Reader::target(sample.unoccluded()) > 0.f);
+        if (dr::none_or<false>(active))
+            return Spectrum(0.f);
+        return visible(vertex, sample, rng, active);
+    }
+
+    /// What arrives of a sample: all or nothing without media
+    Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
+                     Mask active) const {
+        if (!vertex.inside) {
+            Mask occluded = m_scene->ray_test(vertex.si.spawn_ray_to(sample.p), active);
+            return sample.unoccluded() & (active && !occluded);
+        }
+        Interaction3f origin = vertex.origin();
+        if (vertex.at.extent == Extent::Segment)
+            origin.p = sample.from;
+        auto medium =
+            m_media.medium_beyond(vertex.si, vertex.inside->medium, sample.p - origin.p,
+                                  vertex.on_surface(active));
+        return sample.through(
+                   m_media.transmittance(origin, sample.p, medium, rng, active)) &
+               active;
+    }
+
+    /// Numbers for shadow rays through heterogeneous media, each ray with those after the last
+    Rng media_rng(const Vertex &vertex) const {
+        return m_media.kinds().heterogeneous ? make_rng(plain_sample(vertex.u), 2)
+                                             : Rng();
+    }
+
+    const Scene *m_scene;
+    const Lights &m_lights;
+    const Media &m_media;
+    const Strategy &m_strategy;
+    const Samples &m_samples;
+};
+
+} // namespace manylights

@@ -1,0 +1,171 @@
+#pragma once
+
+/**
+ * How lights are chosen, decided once from the parameters and the number N of lights; m is
+ * the number of reservoirs, s <= m that of shadow rays, K the expected number of candidates.
+ *
+ *     method, number of lights        source of candidates    fate of candidates
+ *     any, N <= s                     AllLights               TraceAll
+ *     any, N <= m                     AllLights               KeepAll
+ *     resampled_tree, K <= m; tree    Systematic              KeepAll
+ *     resampled_tree, K > m           Systematic              Resample
+ *     exhaustive, N > m               AllLights               Resample (s = m: TraceAll)
+ *     talk                            Splitting               Resample
+ *     adaptive_splitting              Splitting               TraceAll
+ *
+ * Sampling and its density ask \ref Strategy::with_source alone where candidates come from,
+ * so that they cannot disagree.
+ */
+
+#include "manylights/choice/parameters.h"
+#include "vertex.h"
+#include <algorithm>
+
+namespace manylights {
+
+/// Where candidates come from
+enum class Source { AllLights, Systematic, Splitting };
+
+/// What becomes of candidates: a shadow ray for each, a slot for each, or resampling
+enum class Fate { TraceAll, KeepAll, Resample };
+
+/// What is spent on the first vertex of a path, and on the others
+template <typename FloatD>
+Effort<FloatD> effort_of(const SamplingParameters &params,
+                         const dr::mask_t<FloatD> &first) {
+    using UInt32D = dr::uint32_array_t<FloatD>;
+    return { dr::select(first, dr::opaque<FloatD>(params.expected_candidates()),
+                        dr::opaque<FloatD>(params.expected_deeper())),
+             dr::select(first, dr::opaque<UInt32D>(params.shadow_rays),
+                        dr::opaque<UInt32D>(params.shadow_rays_deeper())) };
+}
+
+/*
+ * The sources: `cursor` starts at the first candidate of a vertex, with its random number of
+ * the tree; `inclusion_probability` is that of `light` to be one of them.
+ */
+
+template <typename FloatD> struct AllLightsSource {
+    using UInt32D = dr::uint32_array_t<FloatD>;
+    using MaskD   = dr::mask_t<FloatD>;
+    const SamplingParameters &params;
+
+    template <typename Vertex>
+    auto cursor(const TreeView<FloatD> &tree, const Vertex &, const FloatD &) const {
+        return AllLights<FloatD>(dr::opaque<UInt32D>(tree.light_count));
+    }
+    FloatD inclusion_probability(const TreeView<FloatD> &, const Receiver<FloatD> &,
+                                 const UInt32D &, const FloatD &, const MaskD &,
+                                 const MaskD &) const {
+        return FloatD(1.f);
+    }
+};
+
+template <typename FloatD> struct SystematicSource {
+    using UInt32D = dr::uint32_array_t<FloatD>;
+    using MaskD   = dr::mask_t<FloatD>;
+    const SamplingParameters &params;
+
+    template <typename Vertex>
+    auto cursor(const TreeView<FloatD> &, const Vertex &vertex, const FloatD &u) const {
+        return SystematicCursor<FloatD>(vertex.top, vertex.effort.candidates, u);
+    }
+    FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
+                                 const UInt32D &light, const FloatD &, const MaskD &first,
+                                 const MaskD &active) const {
+        return dr::minimum(1.f, effort_of<FloatD>(params, first).candidates *
+                                    leaf_probability(tree, at, light, active));
+    }
+};
+
+template <typename FloatD> struct SplittingSource {
+    using UInt32D = dr::uint32_array_t<FloatD>;
+    using MaskD   = dr::mask_t<FloatD>;
+    const SamplingParameters &params;
+
+    template <typename Vertex>
+    auto cursor(const TreeView<FloatD> &tree, const Vertex &vertex,
+                const FloatD &u) const {
+        return start(tree, vertex.at, u);
+    }
+    FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
+                                 const UInt32D &light, const FloatD &u, const MaskD &,
+                                 const MaskD &active) const {
+        return start(tree, at, u).inclusion_probability(tree, at, light, active);
+    }
+
+private:
+    SplittingCursor<FloatD> start(const TreeView<FloatD> &tree,
+                                  const Receiver<FloatD> &at, const FloatD &u) const {
+        return { tree, at, dr::opaque<FloatD>(params.splitting_rate), u,
+                 params.method == Method::Talk ? params.split_function
+                                               : SplitFunction::Variance };
+    }
+};
+
+/// See the top of the file
+struct Strategy {
+    const SamplingParameters &params;
+    Source source;
+    /// Where there are not enough shadow rays for all lights
+    Fate fate;
+    /// Does h or H compare lights with each other?
+    bool compares;
+    /// Places for kept lights, those for lights at infinity, and both
+    uint32_t slots, infinite, items;
+    /// Probability with which a light at infinity is an item: of many, one is chosen
+    float infinite_probability;
+    /// Are there more items than shadow rays, so that some are chosen?
+    bool chooses;
+    /// Are the samples behind the targets kept for the rays instead of being computed again?
+    /// That pays in scalar variants; in LLVM variants each slot is written with a selection.
+    bool keeps_samples;
+
+    /// @param exact_targets  does a target come from the sample that its ray would get?
+    Strategy(const SamplingParameters &params, uint32_t lights, uint32_t infinite_lights,
+             bool exact_targets)
+        : params(params) {
+        bool all      = params.considers_all(lights);
+        source        = all                     ? Source::AllLights
+                        : params.splits_nodes() ? Source::Splitting
+                                                : Source::Systematic;
+        float most    = all ? (float) lights : params.most_candidates();
+        bool fits     = most <= (float) params.reservoirs;
+        fate          = params.traces_all() ? Fate::TraceAll
+                        : fits              ? Fate::KeepAll
+                                            : Fate::Resample;
+        compares      = !(all && fits);
+        slots         = fits ? std::min((uint32_t) most, lights) : params.reservoirs;
+        bool few      = infinite_lights <= kMaxInfinite;
+        infinite      = few ? infinite_lights : 1;
+        items         = slots + infinite;
+        chooses       = !params.traces_all() && items > params.shadow_rays_deeper();
+        keeps_samples = exact_targets && chooses;
+        infinite_probability = few ? 1.f : 1.f / infinite_lights;
+    }
+
+    /// With enough shadow rays for all lights nothing has to be chosen. Kernels are the same
+    /// for all vertices, scalar variants look at each.
+    template <typename FloatD> Fate fate_at(const Effort<FloatD> &effort) const {
+        bool enough;
+        if constexpr (dr::is_jit_v<FloatD>)
+            enough = !chooses;
+        else
+            enough = items <= effort.shadow_rays;
+        return source == Source::AllLights && enough ? Fate::TraceAll : fate;
+    }
+
+    /// Call f with the source of candidates
+    template <typename FloatD, typename F> auto with_source(const F &f) const {
+        switch (source) {
+            case Source::Systematic:
+                return f(SystematicSource<FloatD>{ params });
+            case Source::Splitting:
+                return f(SplittingSource<FloatD>{ params });
+            default:
+                return f(AllLightsSource<FloatD>{ params });
+        }
+    }
+};
+
+} // namespace manylights

@@ -1,0 +1,53 @@
+#pragma once
+
+/// The state of a path, and the limits of all paths.
+
+#include "manylights/direct/vertex.h"
+#include <mitsuba/render/interaction.h>
+#include <mitsuba/render/medium.h>
+#include <mitsuba/render/sampler.h>
+
+namespace manylights {
+
+/// Parameters of the paths, as Mitsuba's
+struct PathLimits {
+    uint32_t max_depth, rr_depth;
+    bool hide_emitters;
+
+    /// Does nothing count that is scattered at a vertex after so many?
+    template <typename UInt32> auto is_last(const UInt32 &depth) const {
+        return depth + 1u >= max_depth;
+    }
+};
+
+/// `max_depth` of paths that only roulette ends
+constexpr uint32_t kUnlimited = (uint32_t) -1;
+/// What a path carries from step to step
+template <typename Float, typename Spectrum> struct PathState {
+    MI_IMPORT_TYPES(Sampler, Medium, MediumPtr)
+    using FloatD = dr::detached_t<Float>;
+
+    Mask active, valid;
+    UInt32 depth;
+    Ray3f ray;
+    PreliminaryIntersection3f pi;
+    MediumPtr medium;
+    Spectrum throughput, result;
+    Float eta;
+    /// The vertex before, for the density of finding its lights by chance
+    Receiver<FloatD> from;
+    Float u_tree, pdf;
+    /// Did the path leave it by a direction that light sampling cannot find?
+    Mask specular;
+    Counts<Float> counts;
+    Sampler *sampler;
+    DRJIT_STRUCT(PathState, active, valid, depth, ray, pi, medium, throughput, result,
+                 eta, from, u_tree, pdf, specular, counts, sampler)
+
+    PathState(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
+        : active(active), valid(false), depth(0), ray(ray), medium(medium),
+          throughput(1.f), result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()),
+          u_tree(0.f), pdf(1.f), specular(true), sampler(sampler) {}
+};
+
+} // namespace manylights
