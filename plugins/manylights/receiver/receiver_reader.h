@@ -24,9 +24,9 @@ public:
         auto v = plain(mitsuba::unpolarized_spectrum(value)) * scale;
         FloatD g;
         if constexpr (mitsuba::is_rgb_v<Spectrum>) {
-            g = root_mean_square(v); // why: see emission_reader.h
-            // Where squares leave the range of floats the largest channel decides
-            g = dr::select(g < 1e-15f || g > 1e15f, dr::max(dr::abs(v)), g);
+            // Why: see emission_reader.h. No square leaves the range of floats
+            FloatD most = dr::max(dr::abs(v));
+            g           = most * root_mean_square(v / most);
         } else {
             g = dr::mean(v);
         }
