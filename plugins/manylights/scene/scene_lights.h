@@ -415,8 +415,7 @@ private:
             for (size_t k = 0; k < places[i].size(); ++k) {
                 LightRow &row = rows[places[i][k]], read = table->rows[k];
                 // Other triangles may have power than before
-                bool triangle =
-                    (read.tag & kTagKindMask) == (uint32_t) LightKind::Triangle;
+                bool triangle = kind_of(read) == LightKind::Triangle;
                 if (triangle &&
                     !std::equal(row.geometry, row.geometry + 9, read.geometry))
                     return false;

@@ -100,7 +100,7 @@ public:
     /// Lights without power, and degenerate ones, stay out
     void add_light(const LightRow &row, const LightBounds &bounds) {
         ++m_table.light_count;
-        LightKind kind = (LightKind) (row.tag & kTagKindMask);
+        LightKind kind = kind_of(row);
         bool hit_able  = has(mitsuba::EmitterFlags::Surface);
         bool by_plugin = hit_able && !(row.tag & kTagTabulated);
         m_table.needs_emitter_eval |= by_plugin;
