@@ -81,6 +81,10 @@ template <typename Float> struct TreeView {
     /// A power of two that brings the largest flux to [1, 2), and its inverse: importances and
     /// targets are in these units, so that images do not depend on the unit of emission
     Float scale = 1.f, unit = 1.f;
+    void set_scale(float value) {
+        scale = dr::opaque<Float>(value);
+        unit  = dr::opaque<Float>(1.f / value);
+    }
     KindSet kinds;
     Directions directions = Directions::All;
     /// What has been learnt of the lights' visibility, null if that is not wanted
