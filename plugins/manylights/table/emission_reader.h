@@ -181,8 +181,7 @@ template <typename Float, typename Spectrum> struct EmissionReader {
 
     /**
      * Root mean square of the channels, negative if they are: what the error of a colour image
-     * is measured by. The luminance would choose blue and purple lights too seldom: with it
-     * the city's coloured windows had 1.06 times the relative mean squared error.
+     * is measured by. The luminance would choose blue and purple lights too seldom.
      */
     static float brightness(const float color[3]) {
         if constexpr (mitsuba::is_monochromatic_v<Spectrum>)

@@ -8,8 +8,8 @@
  * own. Of radiance that varies, the table has the mean over the triangle, sphere, disk or
  * cylinder; the emitter evaluates it at the point that was chosen. Other emitters of finite
  * extent (projectors, exotic shapes) are one light each, sampled through their own plugin
- * after they were selected. Emitters at
- * infinity stay out of the table, and so do those without power.
+ * after they were selected. Emitters at infinity stay out of the table, and so do those
+ * without power.
  *
  * A new kind of emitter gets a reader of its own beside point_lights.h, quadrics.h,
  * mesh_lights.h and other_lights.h, and a line in \ref LightTableReader.
