@@ -34,7 +34,7 @@ Float flat_intensity(const Vector3f &a, const Vector3f &w) {
 }
 
 /// 0 if a light without extent is so near that what arrives is infinite: it is left out
-/// (emission.h) and must not push others out of their reservoirs
+/// (light_points.h) and must not push others out of their reservoirs
 template <typename Float, typename Vector3f> Float can_shine(const Vector3f &w) {
     return dr::select(dr::isfinite(dr::rcp(dr::squared_norm(w))), Float(1.f), 0.f);
 }
@@ -80,9 +80,10 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
             return { w, length2 * (1.f / 12.f) + .5f * radius2,
                      2.f * dr::sqrt(radius2 * length2) + dr::Pi<Float> * radius2 };
         }
-        default:
-            return { origin, row[3], Float(1.f) };
+        case LightKind::Other:
+            break;
     }
+    return { origin, row[3], Float(1.f) };
 }
 
 /**

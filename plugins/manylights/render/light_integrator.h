@@ -2,9 +2,10 @@
 
 /**
  * What the integrators have in common: parameters, the lights of the scene, and rendering in
- * passes between which their visibility is learnt (visibility.h).
+ * passes between which their visibility is learnt (learning_passes.h).
  */
 
+#include "learning_passes.h"
 #include "manylights/choice/parameters.h"
 #include "manylights/scene/light_cache.h"
 #include "passes.h"
@@ -40,7 +41,11 @@ public:
         dr::scoped_flush_denormals flush(true);
         auto lock = lock_learning();
         typename Cache::Rendering guard(m_cache, scene);
-        Learning learning(*this, scene, sensor, spp, guard.lights());
+        bool may_learn =
+            !m_learning && !m_differentiating && m_samples_per_pass == kOnePass;
+        LearningPasses<Float, Spectrum> learning(guard.lights(), m_params, m_learning);
+        if (may_learn)
+            learning.start(scene, sensor, spp);
         if (learning.wanted())
             return render_passes(learning, scene, sensor, seed, develop, evaluate);
         return Base::render(scene, sensor, seed, spp, develop, evaluate);
@@ -74,6 +79,8 @@ protected:
     Cache m_cache;
 
 private:
+    static constexpr uint32_t kOnePass = (uint32_t) -1; // Mitsuba's default
+
     /// One integrator learns from one rendering at a time: others that overlap wait for it
     std::unique_lock<std::recursive_mutex> lock_learning() {
         std::unique_lock<std::recursive_mutex> lock(m_mutex, std::defer_lock);
@@ -89,138 +96,10 @@ private:
         ~Differentiating() { flag = false; }
     };
 
-    static mitsuba::Vector<uint32_t, 2> film_size(const Film *film) {
-        auto size = film->crop_size();
-        if (film->sample_border())
-            size += 2 * film->rfilter()->border_size();
-        return size;
-    }
-
-    /**
-     * What is learnt while rendering. Visibility is learnt from the shadow rays of a first pass, at
-     * most a sixteenth of the samples, and of a second one if the first promises much. All others
-     * are rendered in one pass, whose pattern of samples is then as whole as it can be; in JIT
-     * variants each is recorded anew, which takes 3 to 17 ms. Relative variance times time of a
-     * second training pass and of none, in llvm_ad_rgb with 64 samples for each of 256x144 pixels:
-     * .91 and .98 in a house of 108 rooms with 10,000 and 1,000 lights, 1.04 to 1.12 where less is
-     * hidden. More teach little: trained for 2, 4, 8 and all of 16 passes of the same size, that
-     * house with 1,000 lights had .194, .189, .187 and .187 of relative variance at 603, 628, 664
-     * and 742 ns a sample.
-     */
-    class Learning {
-    public:
-        Learning(LightIntegrator &integrator, const Scene *scene, Sensor *sensor,
-                 uint32_t spp, Lights &lights)
-            : m_integrator(integrator), m_lights(lights) {
-            const SamplingParameters &params = integrator.m_params;
-            if (params.learn_visibility == LearnVisibility::No || integrator.m_learning ||
-                integrator.m_differentiating ||
-                integrator.m_samples_per_pass != kOnePass ||
-                params.considers_all(lights.tree().light_count) ||
-                has_entry_for_each_sample(sensor))
-                return;
-            Sampler *sampler = sensor->sampler();
-            if (spp)
-                sampler->set_sample_count(spp);
-            spp             = sampler->sample_count();
-            uint32_t pixels = dr::prod(film_size(sensor->film()));
-            double total    = (double) pixels * spp;
-            m_training      = training_samples(spp, pixels);
-            if (spp < kLeastSamples || total < kLeastTotal || total > kMostTotal)
-                return;
-            lights.start_learning(scene, cell_size(scene, sensor), total, keeps());
-            integrator.m_learning = m_wanted = true;
-        }
-        ~Learning() {
-            if (!m_wanted)
-                return;
-            m_integrator.m_learning = false;
-            m_lights.stop_learning(keeps());
-        }
-        Learning(const Learning &) = delete;
-
-        bool wanted() const { return m_wanted; }
-
-        /// Returns the samples per pixel of a pass, of `left` that have not been rendered
-        uint32_t start_pass(uint32_t pass, uint32_t left) {
-            if (pass > 0 && m_trains)
-                m_trains = m_lights.learn(/* go_on = */ pass < kTraining);
-            return m_trains ? std::min(m_training, left) : left;
-        }
-
-    private:
-        static constexpr uint32_t kTraining = 2,
-                                  kOnePass  = (uint32_t) -1; // Mitsuba's default
-        /// The image has the noise of these samples, too. Error times time without learning, over
-        /// that with it, if 1/16, 1/32 and 1/64 of 64 samples train: 1.96, 2.05, 1.98 with 256 x
-        /// 144 pixels in llvm_ad_rgb (geometric mean of eight scenes); 1.83, 2.04, 2.16 with 1280 x
-        /// 720 in cuda_ad_rgb (six scenes; in a house with 1,000 lights 6.0, 7.9, 9.3).
-        static constexpr uint32_t kTrainingTotal = 1 << 16;
-        /// Of three, the first would be a large part, and it is the slowest
-        static constexpr uint32_t kLeastSamples = 4;
-        /// A wavefront has less than 2^32 lanes, and some may be left over
-        static constexpr double kMostTotal =
-            dr::is_jit_v<Float> ? 0x1p31 : dr::Infinity<double>;
-        /// With fewer samples, recording one more pass takes longer than it may gain. On an H100 the
-        /// mean of five scenes, as above, was 1.39 at 1.5e7 samples, 1.15 at 3.7e6 and .91 at 9e5
-        static constexpr double kLeastTotal =
-            dr::is_cuda_v<Float> ? 0x1p23 : (dr::is_llvm_v<Float> ? 0x1p19 : 0);
-
-        bool keeps() const {
-            return m_integrator.m_params.learn_visibility == LearnVisibility::Keep;
-        }
-
-        /// Per pixel: kTrainingTotal in the image if a sixteenth of all are as many, and a divisor
-        static uint32_t training_samples(uint32_t spp, uint32_t pixels) {
-            uint32_t enough  = (kTrainingTotal + pixels - 1) / pixels,
-                     samples = std::max(std::min(spp / 16, enough), 1u);
-            while (spp % samples)
-                --samples;
-            return samples;
-        }
-
-        static CellSize cell_size(const Scene *scene, const Sensor *sensor) {
-            CellSize result;
-            auto camera = sensor->world_transform().translation();
-            for (size_t i = 0; i < 3; ++i) {
-                if constexpr (dr::is_jit_v<Float>)
-                    result.camera[i] = (float) dr::slice(dr::detach(camera.entry(i)));
-                else
-                    result.camera[i] = (float) camera.entry(i);
-            }
-            result.scene = (float) dr::norm(scene->bbox().extents());
-            return result;
-        }
-
-        /// Does a parameter of the sensor have one entry for each sample of a rendering? All
-        /// samples are then rendered at once.
-        static bool has_entry_for_each_sample(const Sensor *sensor) {
-            struct Visitor : mitsuba::TraversalCallback {
-                size_t entries = 1;
-                void put_value(std::string_view, void *value, uint32_t,
-                               const std::type_info &type) override {
-                    if (type == typeid(Float))
-                        entries = std::max(entries, dr::width(*(const Float *) value));
-                }
-                void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
-            } visitor;
-            if constexpr (dr::is_jit_v<Float>) {
-                visitor.entries = dr::width(sensor->world_transform().matrix);
-                const_cast<Sensor *>(sensor)->traverse(&visitor);
-            }
-            return visitor.entries > 1;
-        }
-
-        LightIntegrator &m_integrator;
-        Lights &m_lights;
-        bool m_wanted = false, m_trains = true;
-        /// Samples per pixel of a training pass
-        uint32_t m_training;
-    };
-
-    /// Mitsuba's passes are all of one size, those of \ref Learning are not
-    TensorXf render_passes(Learning &learning, Scene *scene, Sensor *sensor,
-                           const UInt32 &seed, bool develop, bool evaluate) {
+    /// Mitsuba's passes are all of one size, those of \ref LearningPasses are not
+    TensorXf render_passes(LearningPasses<Float, Spectrum> &learning, Scene *scene,
+                           Sensor *sensor, const UInt32 &seed, bool develop,
+                           bool evaluate) {
         m_stop = false;
         m_render_timer.reset();
         Film *film       = sensor->film();

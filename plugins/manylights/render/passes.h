@@ -8,12 +8,22 @@
 #include <drjit/jit.h>
 #include <mitsuba/core/math.h>
 #include <mitsuba/core/random.h>
+#include <mitsuba/core/vector.h>
+#include <mitsuba/render/film.h>
 #include <mitsuba/render/sampler.h>
 #include <string_view>
 
 namespace manylights {
 
 namespace dr = drjit;
+
+/// Pixels that are rendered: with those beyond the border that the filter reaches, if wanted
+template <typename Film> mitsuba::Vector<uint32_t, 2> film_size(const Film *film) {
+    auto size = film->crop_size();
+    if (film->sample_border())
+        size += 2 * film->rfilter()->border_size();
+    return size;
+}
 
 /// How a sampler's numbers belong together
 struct SamplerKind {

@@ -13,6 +13,7 @@
  * program, which may change the scene between two calls, is known by belonging to Python.
  */
 
+#include "scene_fingerprint.h"
 #include "scene_lights.h"
 #include <atomic>
 #include <memory>
@@ -156,7 +157,7 @@ private:
     /// Make the lights of a scene current, and build or refit them if they are new or changed
     EntryPtr update(const Scene *scene) const {
         refuse_freezing();
-        Fingerprint<Float> fingerprint = Lights::fingerprint(scene);
+        Fingerprint<Float> fingerprint = scene_fingerprint<Float, Spectrum>(scene);
         for (const EntryPtr &entry : m_entries)
             if (entry && entry->scene == scene &&
                 (entry->fingerprint == fingerprint || refit(*entry, fingerprint)))

@@ -7,6 +7,7 @@
 
 #include "light_row.h"
 #include "manylights/base/device_scalars.h"
+#include "manylights/base/host_view.h"
 #include "manylights/base/loop.h"
 #include "manylights/base/parameter_reader.h"
 #include <cmath>
@@ -59,35 +60,6 @@ template <typename Float> float read_scalar(const Float &value) {
     read_scalars<Float, 1>({ &value }, result);
     return result[0];
 }
-
-/// A buffer as it lies in memory; a copy only if that is a GPU's
-template <typename Buffer> class HostView {
-public:
-    using T = dr::scalar_t<Buffer>;
-
-    explicit HostView(const Buffer &buffer) : m_size(dr::width(buffer)) {
-        if (m_size == 0)
-            return;
-        if constexpr (dr::is_jit_v<Buffer>) {
-            m_kept = dr::detach<false>(buffer);
-            if constexpr (dr::is_cuda_v<Buffer>)
-                m_kept = dr::migrate(m_kept, JitBackend::None);
-            m_data = m_kept.data();
-            dr::sync_thread();
-        } else {
-            m_data = buffer.data();
-        }
-    }
-    const T *data() const { return m_data; }
-    size_t size() const { return m_size; }
-    const T &operator[](size_t i) const { return m_data[i]; }
-
-private:
-    struct Nothing {};
-    std::conditional_t<dr::is_jit_v<Buffer>, dr::detached_t<Buffer>, Nothing> m_kept;
-    const T *m_data = nullptr;
-    size_t m_size;
-};
 
 /// Emission of an emitter, or of a part of it
 struct Emission {
@@ -209,8 +181,7 @@ template <typename Float, typename Spectrum> struct EmissionReader {
 
     /**
      * Root mean square of the channels, negative if they are: what the error of a colour image
-     * is measured by. The luminance would choose blue and purple lights too seldom: with it
-     * the city's coloured windows had 1.06 times the relative mean squared error.
+     * is measured by. The luminance would choose blue and purple lights too seldom.
      */
     static float brightness(const float color[3]) {
         if constexpr (mitsuba::is_monochromatic_v<Spectrum>)

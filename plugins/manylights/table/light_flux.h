@@ -30,16 +30,11 @@ inline void cross(const float u[3], const float v[3], float out[3]) {
     }
 }
 
-/// Area of an emissive surface
-inline float light_area(const LightRow &row, LightKind kind) {
-    const float *g = row.geometry;
-    if (kind == LightKind::Sphere)
-        return 4 * kPi * g[3] * g[3];
-    if (kind == LightKind::Cylinder)
-        return 2 * kPi * g[6] * norm(g + 3);
+/// Area of the parallelogram of two edges
+inline float edge_area(const float u[3], const float v[3]) {
     float normal[3];
-    cross(g + 3, g + 6, normal);
-    return norm(normal) * (kind == LightKind::Triangle ? .5f : kPi);
+    cross(u, v, normal);
+    return norm(normal);
 }
 
 /// Power of a spot of intensity 1, uniform up to the middle of the transition
@@ -52,19 +47,30 @@ inline float spot_power(float cutoff, float inverse_transition) {
 }
 
 inline double light_power(const LightRow &row) {
-    LightKind kind    = (LightKind) (row.tag & kTagKindMask);
+    const float *g    = row.geometry;
     double brightness = row.brightness;
-    if (kind == LightKind::Point || kind == LightKind::Other)
-        return 4 * kPi * brightness;
-    if (kind == LightKind::Spot)
-        return spot_power(row.geometry[6], row.geometry[7]) * brightness;
-    return light_area(row, kind) * kPi * brightness;
+    switch (kind_of(row)) {
+        case LightKind::Point:
+        case LightKind::Other:
+            return 4 * kPi * brightness;
+        case LightKind::Spot:
+            return spot_power(g[6], g[7]) * brightness;
+        case LightKind::Triangle:
+            return edge_area(g + 3, g + 6) * .5f * kPi * brightness;
+        case LightKind::Disk:
+            return edge_area(g + 3, g + 6) * kPi * kPi * brightness;
+        case LightKind::Sphere:
+            return 4 * kPi * g[3] * g[3] * kPi * brightness;
+        case LightKind::Cylinder:
+            return 2 * kPi * g[6] * norm(g + 3) * kPi * brightness;
+    }
+    return 0;
 }
 
 /// Weight in the tree (see LightBounds); `beams`: do narrow spots matter in the scene?
 inline double light_flux(const LightRow &row, bool beams) {
     double power = light_power(row);
-    if (!beams && (row.tag & kTagKindMask) == (uint32_t) LightKind::Spot)
+    if (!beams && kind_of(row) == LightKind::Spot)
         return std::sqrt(power * 4 * kPi * row.brightness);
     return power;
 }

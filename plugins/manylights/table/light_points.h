@@ -172,7 +172,7 @@ LightPoint<Float> sample_light(const Row<Float> &row, LightKind kind,
         case LightKind::Cylinder:
             result = sample_cylinder(row, x, u);
             break;
-        default:
+        case LightKind::Other:
             return result;
     }
     result.weight = dr::select(result.pdf > 0.f, dr::rcp(result.pdf), 0.f);
@@ -195,9 +195,12 @@ mitsuba::Vector<Float, 3> light_normal(const Row<Float> &row, LightKind kind,
             return dr::normalize(w - axis * (dr::dot(w, axis) / dr::squared_norm(axis))) *
                    row[7];
         }
-        default:
-            return Vector3f(0.f);
+        case LightKind::Point:
+        case LightKind::Spot:
+        case LightKind::Other:
+            break;
     }
+    return Vector3f(0.f);
 }
 
 /// Density with which \ref sample_light would choose the point `p` of geometric normal `n`
@@ -217,9 +220,12 @@ Float light_pdf(const Row<Float> &row, LightKind kind, const mitsuba::Point<Floa
         case LightKind::Cylinder:
             return area_to_solid_angle<Float>(
                 dr::TwoPi<Float> * row[6] * dr::norm(row.vector(3)), w, n);
-        default:
-            return Float(0.f);
+        case LightKind::Point:
+        case LightKind::Spot:
+        case LightKind::Other:
+            break;
     }
+    return Float(0.f);
 }
 
 } // namespace manylights

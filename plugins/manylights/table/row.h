@@ -23,6 +23,14 @@ template <typename Float> struct Row {
     UInt32 bits(size_t i) const { return dr::reinterpret_array<UInt32>(data[i]); }
     UInt32 kind() const { return bits(kTag) & kTagKindMask; }
     Mask is(LightKind k) const { return kind() == (uint32_t) k; }
+    /// Is it a point, which no ray hits?
+    Mask is_delta() const {
+        Mask result(false);
+        for (uint32_t i = 0; i < kLightKinds; ++i)
+            if (manylights::is_delta((LightKind) i))
+                result |= is((LightKind) i);
+        return result;
+    }
     Mask tabulated() const { return (bits(kTag) & kTagTabulated) != 0u; }
     Mask two_sided() const { return (bits(kTag) & kTagTwoSided) != 0u; }
     UInt32 emitter() const { return bits(kTag) >> kTagEmitterShift; }

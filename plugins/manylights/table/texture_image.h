@@ -12,6 +12,7 @@
 #include <memory>
 #include <mitsuba/render/texture.h>
 #include <optional>
+#include <unordered_map>
 
 namespace manylights {
 
@@ -196,6 +197,25 @@ private:
     double m_to_uv[2][3], m_inverse;
     std::optional<BrightnessMap> m_map;
     float m_least = 0;
+};
+
+/// The bitmaps that emitters show, each read at first use
+template <typename Float, typename Spectrum> class ShownImages {
+public:
+    MI_IMPORT_TYPES(Emitter)
+    using Image = TextureImage<Float, Spectrum>;
+
+    /// The one that makes an emitter shine; null if it is something else
+    const Image *of(const Emitter *emitter) {
+        const mitsuba::Object *radiance = ParameterReader(emitter).object("radiance");
+        auto [entry, added]             = m_images.try_emplace(radiance);
+        if (added)
+            entry->second = Image::read(radiance);
+        return entry->second.get();
+    }
+
+private:
+    std::unordered_map<const mitsuba::Object *, std::unique_ptr<Image>> m_images;
 };
 
 } // namespace manylights

@@ -136,9 +136,25 @@ struct Node {
     uint32_t wide_count;
 };
 
-class Builder {
+/// The cluster of one light
+Cluster leaf_cluster(const LightBounds &light) {
+    Cluster c;
+    for (int i = 0; i < 3; ++i) {
+        c.box_min[i] = light.box_min[i];
+        c.box_max[i] = light.box_max[i];
+        c.mean[i]    = light.mean[i];
+        c.axis[i]    = light.axis[i] / light.weight;
+    }
+    c.variance = light.variance;
+    c.flux     = light.weight / kFluxScale;
+    c.cost     = 0;
+    return c;
+}
+
+/// Sorts lights into a binary tree
+class BinaryTree {
 public:
-    explicit Builder(HostVector<LightBounds> &&lights) : m_lights(std::move(lights)) {
+    explicit BinaryTree(HostVector<LightBounds> &&lights) : m_lights(std::move(lights)) {
         size_t chunks = chunk_count(m_lights.size());
         std::vector<double> flux(chunks, 0.0);
         std::vector<Centroids> centroids(chunks);
@@ -161,35 +177,22 @@ public:
         m_nodes.resize(m_lights.empty() ? 0 : m_lights.size() - 1);
     }
 
-    LightTree build(const NodeMemory &memory, bool keep_binary) {
-        LightTree tree;
-        uint32_t count = (uint32_t) m_lights.size();
-        if (count == 0)
-            return tree;
-        Subtree root{ 0, count, 0 };
-        split(root, m_centroids, 0);
+    const HostVector<LightBounds> &lights() const { return m_lights; }
+    HostVector<Node> &nodes() { return m_nodes; }
 
-        Extent extent   = measure(root);
-        tree.wide_count = extent.count;
-        tree.depth      = extent.depth;
-        tree.link.resize(count);
-        tree.node_link.resize(tree.wide_count);
-        m_wide      = memory(tree.wide_count);
-        m_link      = tree.link.data();
-        m_node_link = tree.node_link.data();
-        collapse(root, 0, kNone);
-        if (keep_binary) {
-            tree.binary.reserve(2 * (size_t) count - 1);
-            write_binary(tree.binary, root);
-        }
+    /// Sort all lights and fill the nodes
+    void split(const Subtree &root) { split(root, m_centroids, 0); }
 
-        tree.order.resize(count);
-        for_chunks(count, [&](size_t, size_t begin, size_t end) {
+    /// Fluxes in the order of the leaves; the rest of the lights is given back
+    HostVector<float> take_flux() {
+        HostVector<float> flux(m_lights.size());
+        for_chunks(flux.size(), [&](size_t, size_t begin, size_t end) {
             for (size_t i = begin; i < end; ++i)
-                tree.order[i] = m_lights[i].light;
+                flux[i] = m_lights[i].flux;
         });
-        refit_tree(m_wide, tree.wide_count, take_flux());
-        return tree;
+        HostVector<LightBounds>().swap(m_lights);
+        HostVector<Node>().swap(m_nodes);
+        return flux;
     }
 
 private:
@@ -199,22 +202,6 @@ private:
         for (float &coordinate : light.axis)
             coordinate *= light.weight;
     }
-
-    static Cluster leaf_cluster(const LightBounds &light) {
-        Cluster c;
-        for (int i = 0; i < 3; ++i) {
-            c.box_min[i] = light.box_min[i];
-            c.box_max[i] = light.box_max[i];
-            c.mean[i]    = light.mean[i];
-            c.axis[i]    = light.axis[i] / light.weight;
-        }
-        c.variance = light.variance;
-        c.flux     = light.weight / kFluxScale;
-        c.cost     = 0;
-        return c;
-    }
-
-    // ---------------------------------------------------------------------- Binary tree
 
     /// Sort the lights of a subtree and fill its nodes; returns its cluster
     Cluster split(const Subtree &tree, const Centroids &centroids, uint32_t depth) {
@@ -364,25 +351,23 @@ private:
         }
     }
 
-    // ------------------------------------------------------------------------ Wide tree
+    HostVector<LightBounds> m_lights;
+    HostVector<Node> m_nodes;
+    Centroids m_centroids;
+};
 
-    /// Size of a wide tree
-    struct Extent {
-        uint32_t count, depth;
-    };
+// --------------------------------------------------------------------------- Wide tree
 
-    /// Call f(slot) for the interior ones of the children of a wide node
-    template <typename F>
-    static void for_interior(const std::array<Subtree, 4> &children, uint32_t count,
-                             const F &f) {
-        Tasks tasks;
-        for (uint32_t slot = 0; slot < count; ++slot) {
-            if (children[slot].count() > kTaskLights)
-                tasks.start([&f, slot] { f(slot); });
-            else if (!children[slot].is_leaf())
-                f(slot);
-        }
-    }
+/// Size of a wide tree
+struct Extent {
+    uint32_t count, depth;
+};
+
+/// Writes the nodes of a finished binary tree as kernels read them
+class NodeWriter {
+public:
+    NodeWriter(const HostVector<LightBounds> &lights, HostVector<Node> &nodes)
+        : m_lights(lights), m_nodes(nodes) {}
 
     /// Note how many wide nodes there are in each subtree at which one begins
     Extent measure(const Subtree &root) {
@@ -399,6 +384,60 @@ private:
         if (!root.is_leaf())
             m_nodes[root.node].wide_count = sum.count;
         return sum;
+    }
+
+    /// All wide nodes, to `nodes`, and where lights and nodes hang, to `tree`
+    void write_wide(const Subtree &root, WideNode *nodes, LightTree &tree) {
+        m_wide      = nodes;
+        m_link      = tree.link.data();
+        m_node_link = tree.node_link.data();
+        collapse(root, 0, kNone);
+    }
+
+    /// Append the nodes of a subtree, leaves included; returns its cluster
+    Cluster write_binary(std::vector<BinaryNode> &nodes, const Subtree &tree) const {
+        uint32_t index = (uint32_t) nodes.size(),
+                 most  = 2 * (uint32_t) m_lights.size() - 1;
+        nodes.emplace_back();
+        BinaryNode node{};
+        node.first  = tree.begin;
+        node.right  = kNone;
+        node.light  = tree.is_leaf() ? tree.begin : kNone;
+        node.escape = index + 2 * tree.count() - 1;
+        if (node.escape == most)
+            node.escape = kNone;
+        Cluster c;
+        if (tree.is_leaf()) {
+            c = leaf_cluster(m_lights[tree.begin]);
+        } else {
+            uint32_t middle = m_nodes[tree.node].middle;
+            Subtree left    = tree.left(middle);
+            node.right      = index + 2 * left.count();
+            c               = write_binary(nodes, left);
+            c               = join(c, write_binary(nodes, tree.right(middle)));
+        }
+        std::copy_n(c.box_min, 3, node.box_min);
+        std::copy_n(c.box_max, 3, node.box_max);
+        std::copy_n(c.mean, 3, node.mean);
+        node.variance = c.variance;
+        node.flux     = c.flux;
+        node.axis     = pack_axis(c.axis);
+        nodes[index]  = node;
+        return c;
+    }
+
+private:
+    /// Call f(slot) for the interior ones of the children of a wide node
+    template <typename F>
+    static void for_interior(const std::array<Subtree, 4> &children, uint32_t count,
+                             const F &f) {
+        Tasks tasks;
+        for (uint32_t slot = 0; slot < count; ++slot) {
+            if (children[slot].count() > kTaskLights)
+                tasks.start([&f, slot] { f(slot); });
+            else if (!children[slot].is_leaf())
+                f(slot);
+        }
     }
 
     /// Write the wide nodes of a subtree, parents first, with the moments of leaves alone
@@ -461,57 +500,45 @@ private:
         return x.cost != y.cost ? x.cost > y.cost : x.flux > y.flux;
     }
 
-    /// Append the nodes of a subtree, leaves included; returns its cluster
-    Cluster write_binary(std::vector<BinaryNode> &nodes, const Subtree &tree) const {
-        uint32_t index = (uint32_t) nodes.size(),
-                 most  = 2 * (uint32_t) m_lights.size() - 1;
-        nodes.emplace_back();
-        BinaryNode node{};
-        node.first  = tree.begin;
-        node.right  = kNone;
-        node.light  = tree.is_leaf() ? tree.begin : kNone;
-        node.escape = index + 2 * tree.count() - 1;
-        if (node.escape == most)
-            node.escape = kNone;
-        Cluster c;
-        if (tree.is_leaf()) {
-            c = leaf_cluster(m_lights[tree.begin]);
-        } else {
-            uint32_t middle = m_nodes[tree.node].middle;
-            Subtree left    = tree.left(middle);
-            node.right      = index + 2 * left.count();
-            c               = write_binary(nodes, left);
-            c               = join(c, write_binary(nodes, tree.right(middle)));
-        }
-        std::copy_n(c.box_min, 3, node.box_min);
-        std::copy_n(c.box_max, 3, node.box_max);
-        std::copy_n(c.mean, 3, node.mean);
-        node.variance = c.variance;
-        node.flux     = c.flux;
-        node.axis     = pack_axis(c.axis);
-        nodes[index]  = node;
-        return c;
-    }
-
-    /// Fluxes in the order of the leaves; the rest of the lights is given back
-    HostVector<float> take_flux() {
-        HostVector<float> flux(m_lights.size());
-        for_chunks(flux.size(), [&](size_t, size_t begin, size_t end) {
-            for (size_t i = begin; i < end; ++i)
-                flux[i] = m_lights[i].flux;
-        });
-        HostVector<LightBounds>().swap(m_lights);
-        HostVector<Node>().swap(m_nodes);
-        return flux;
-    }
-
-    HostVector<LightBounds> m_lights;
-    HostVector<Node> m_nodes;
-    Centroids m_centroids;
+    const HostVector<LightBounds> &m_lights;
+    HostVector<Node> &m_nodes;
     /// Where the wide nodes, the lights' links and the nodes' links are written to
     WideNode *m_wide = nullptr;
     uint32_t *m_link = nullptr, *m_node_link = nullptr;
 };
+
+/// See \ref build_tree
+LightTree build(HostVector<LightBounds> &&lights, const NodeMemory &memory,
+                bool keep_binary) {
+    LightTree tree;
+    BinaryTree binary(std::move(lights));
+    uint32_t count = (uint32_t) binary.lights().size();
+    if (count == 0)
+        return tree;
+    Subtree root{ 0, count, 0 };
+    binary.split(root);
+
+    NodeWriter writer(binary.lights(), binary.nodes());
+    Extent extent   = writer.measure(root);
+    tree.wide_count = extent.count;
+    tree.depth      = extent.depth;
+    tree.link.resize(count);
+    tree.node_link.resize(tree.wide_count);
+    WideNode *wide = memory(tree.wide_count);
+    writer.write_wide(root, wide, tree);
+    if (keep_binary) {
+        tree.binary.reserve(2 * (size_t) count - 1);
+        writer.write_binary(tree.binary, root);
+    }
+
+    tree.order.resize(count);
+    for_chunks(count, [&](size_t, size_t begin, size_t end) {
+        for (size_t i = begin; i < end; ++i)
+            tree.order[i] = binary.lights()[i].light;
+    });
+    refit_tree(wide, tree.wide_count, binary.take_flux());
+    return tree;
+}
 
 // ------------------------------------------------------------------------------- Refit
 
@@ -614,8 +641,7 @@ private:
 LightTree build_tree(HostVector<LightBounds> &&lights, const NodeMemory &memory,
                      bool keep_binary) {
     LightTree tree;
-    run_with_denormals(
-        [&] { tree = Builder(std::move(lights)).build(memory, keep_binary); });
+    run_with_denormals([&] { tree = build(std::move(lights), memory, keep_binary); });
     return tree;
 }
 

@@ -81,6 +81,10 @@ template <typename Float> struct TreeView {
     /// A power of two that brings the largest flux to [1, 2), and its inverse: importances and
     /// targets are in these units, so that images do not depend on the unit of emission
     Float scale = 1.f, unit = 1.f;
+    void set_scale(float value) {
+        scale = dr::opaque<Float>(value);
+        unit  = dr::opaque<Float>(1.f / value);
+    }
     KindSet kinds;
     Directions directions = Directions::All;
     /// What has been learnt of the lights' visibility, null if that is not wanted
@@ -270,10 +274,8 @@ ChildChoice<Float> choose_child(const ClusterWeights<Float, N> &weights,
  * Weights of the root's grandchildren, all compared with each other, once for each receiver:
  * descents begin below them. The sums are written into the receiver, for the density.
  *
- * Large clusters are those of which h knows least. With a root of four children like all other
- * nodes, error times time was 1.2 times as large in the geometric mean of ten scenes with direct
- * light in LLVM variants (.96 to 2.1), since its variance was higher and a sample took 1.03 to
- * 1.12 times as long; with paths of three bounces 1.05 to 1.11 times (four scenes).
+ * Large clusters are those of which h knows least: a root of four children like all other nodes
+ * has more variance, and a sample takes longer.
  */
 template <typename Float> struct TopWeights : ClusterWeights<Float, kTopClusters> {
     using UInt32 = dr::uint32_array_t<Float>;

@@ -1,0 +1,77 @@
+#pragma once
+
+/**
+ * What rays have taught about the visibility of a scene's lights (visibility.h), from one
+ * rendering to the next if that is wanted.
+ */
+
+#include "fingerprint.h"
+#include "manylights/learning/visibility.h"
+#include "scene_shapes.h"
+#include <memory>
+
+namespace manylights {
+
+template <typename Float, typename Spectrum> class VisibilityLearner {
+public:
+    using Scene = mitsuba::Scene<Float, Spectrum>;
+    using Shape = mitsuba::Shape<Float, Spectrum>;
+    using Table = VisibilityTable<dr::detached_t<Float>>;
+
+    /**
+     * Learn from now on: anew, or in addition to what was kept if the shapes are still the same.
+     * The table has 512 records for each of `nodes`, about as many as there are cells in sight,
+     * but no more than `samples` are expected, and at most 38 MB.
+     */
+    void start(const Scene *scene, const CellSize &size, uint32_t nodes, double samples,
+               bool keep) {
+        double wanted    = std::min(512. * nodes, samples);
+        uint32_t records = 1u << 12;
+        while (records < kMostRecords && records < wanted)
+            records *= 2;
+        Fingerprint<Float> shapes(0);
+        if (keep)
+            for_each_shape(scene, [&](const Shape *shape) { shapes.add_emitter(shape); });
+        if (keep && m_table && shapes.same_places(m_shapes)) {
+            m_table->prepare(records, size);
+        } else {
+            m_table  = std::make_unique<Table>(records, size);
+            m_shapes = std::move(shapes);
+            m_shapes.hold();
+        }
+        m_table->set_counting(true);
+        m_used = true;
+    }
+
+    /// Use what was learnt so far, if it is worth it, and learn on if that is wanted and worth
+    /// it, too. Returns whether it does.
+    bool learn(bool go_on) {
+        float gain = m_table->learn();
+        if (gain < kLeastGain)
+            m_used = false;
+        go_on = go_on && gain > kLargeGain;
+        m_table->set_counting(go_on);
+        return go_on;
+    }
+
+    void stop(bool keep) {
+        m_table->set_counting(false);
+        if (keep)
+            return;
+        m_used = false;
+        m_table.reset();
+    }
+
+    /// What kernels use; null if that is nothing
+    const Table *in_use() const { return m_used ? m_table.get() : nullptr; }
+
+private:
+    static constexpr uint32_t kMostRecords = 1u << 20;
+
+    std::unique_ptr<Table> m_table;
+    /// The shapes where it was learnt
+    Fingerprint<Float> m_shapes{ 0 };
+    bool m_used = false;
+};
+
+} // namespace manylights
