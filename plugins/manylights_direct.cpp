@@ -179,10 +179,11 @@ public:
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         auto lights = m_cache.get(scene, sampler);
         DirectLight direct(scene, *lights, m_params);
-        return manylights::differentiable<Float>(sampler, [&] {
-            return manylights::call_flat<Float>(
-                [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
-        });
+        return manylights::differentiable<Float>(
+            sampler, (*lights).evaluates_loops(), [&] {
+                return manylights::call_flat<Float>(
+                    [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
+            });
     }
 
     /// Radiance along a ray, and whether it met anything

@@ -164,11 +164,12 @@ public:
         PathTracer tracer(scene, *lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;
-        auto result = manylights::differentiable<Float>(sampler, [&] {
-            return manylights::call_flat<Float>([&] {
-                return tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+        auto result =
+            manylights::differentiable<Float>(sampler, (*lights).evaluates_loops(), [&] {
+                return manylights::call_flat<Float>([&] {
+                    return tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+                });
             });
-        });
         if (m_params.counts)
             counts.write(aovs, m_params);
         return result;

@@ -47,11 +47,15 @@ void loop(State &state, const Cond &cond, const Body &body, const char *name) {
     }
 }
 
-/// Returns f(), with evaluated loops if a derivative passes through any of them. They may change
-/// the state of `object`.
+/// Returns f(), with evaluated loops if a derivative passes through any of them, or if that is
+/// asked for. They may change the state of `object`.
 template <typename Float, typename Object, typename F>
-auto differentiable(Object *object, const F &f) {
+auto differentiable(Object *object, bool evaluated, const F &f) {
     if constexpr (dr::is_diff_v<Float>) {
+        if (evaluated) {
+            dr::scoped_set_flag guard(JitFlag::SymbolicLoops, false);
+            return f();
+        }
         dr::detail::index64_vector before;
         dr::detail::collect_indices<true>(object, before);
         try {
@@ -68,6 +72,7 @@ auto differentiable(Object *object, const F &f) {
         return f();
     } else {
         (void) object;
+        (void) evaluated;
         return f();
     }
 }

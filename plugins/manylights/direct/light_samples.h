@@ -186,7 +186,7 @@ private:
         }
         bool delta_only = !m_lights.can_be_hit();
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
-        Mask delta      = row.kind() <= (uint32_t) LightKind::Spot;
+        Mask delta      = row.is_delta();
         Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
         return Sample::make(f & active, emission * Float(point.weight) & active,
                             Point3f(point.p), from.p);

@@ -138,6 +138,14 @@ public:
     /// Media of the shapes and sensors
     const MediaKinds &media() const { return m_media; }
     const std::vector<const Emitter *> &infinite() const { return m_infinite; }
+    /// Mitsuba's `timed_sunsky` looks at numbers of lanes, which recorded loops do not have
+    bool evaluates_loops() const {
+        bool result = false;
+        if constexpr (dr::is_jit_v<Float>)
+            for (const Emitter *emitter : m_infinite)
+                result |= emitter->class_name() == "TimedSunskyEmitter";
+        return result;
+    }
     /// The same as a buffer for kernels
     const mitsuba::DynamicBuffer<EmitterPtr> &infinite_dr() const {
         return m_infinite_dr;
