@@ -149,8 +149,8 @@ class ManyLightsVolpath final : public PathBase<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(PathBase, m_max_depth, m_rr_depth, m_hide_emitters, m_params, m_cache)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium)
-    using PathTracer = manylights::PathTracer<Float, Spectrum>;
-    using Media      = manylights::Media<Float, Spectrum>;
+    using PathTracer   = manylights::PathTracer<Float, Spectrum>;
+    using MediumReader = manylights::MediumReader<Float, Spectrum>;
 
     ManyLightsVolpath(const Properties &props)
         : Base(props, manylights::read_path_parameters(props)) {}
@@ -160,7 +160,7 @@ public:
                                      Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         auto lights = m_cache.get(scene, sampler);
-        auto media  = Media::with((*lights).media(), scene, medium);
+        auto media  = MediumReader::with((*lights).media(), scene, medium);
         PathTracer tracer(scene, *lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;

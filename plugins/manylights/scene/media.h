@@ -1,8 +1,8 @@
 #pragma once
 
 /**
- * Participating media: which ones a scene has, free flights along a path, and what they
- * leave of the light along a shadow ray.
+ * Participating media: free flights along a path, and what is left of the light along a
+ * shadow ray.
  *
  * One homogeneous piece of a ray is handled in closed form. Heterogeneous media are tracked
  * against their majorant in small loops of their own, so that the rest of a path's kernel
@@ -10,8 +10,7 @@
  */
 
 #include "manylights/base/loop.h"
-#include "manylights/table/emission_reader.h"
-#include "scene_shapes.h"
+#include "media_kinds.h"
 #include <drjit/random.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/medium.h>
@@ -20,94 +19,10 @@
 
 namespace manylights {
 
-/// What kinds of media there are: code for others is not even recorded
-struct MediaKinds {
-    bool any = false, homogeneous = false, heterogeneous = false;
-    /// Does the extinction of any vary with the wavelength? Do homogeneous ones scatter?
-    bool chromatic = false, scattering = false;
-
-    uint32_t bits() const {
-        return any + 2 * homogeneous + 4 * heterogeneous + 8 * chromatic +
-               16 * scattering;
-    }
-};
-
-/// Reads of a medium what decides which code its scene needs; "may" where it cannot be known
-template <typename Float, typename Spectrum> struct MediumReader {
-    using Medium = mitsuba::Medium<Float, Spectrum>;
-    using Color  = mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
-
-    static void add(MediaKinds &kinds, const Medium *medium) {
-        if (!medium)
-            return;
-        kinds.any        = true;
-        bool homogeneous = medium->is_homogeneous();
-        (homogeneous ? kinds.homogeneous : kinds.heterogeneous) = true;
-        // The majorant of Mitsuba's heterogeneous media is a single number
-        if (homogeneous || medium->class_name() != "HeterogeneousMedium")
-            kinds.chromatic |= may_be_chromatic(medium);
-        if (homogeneous && !kinds.scattering)
-            kinds.scattering = may_scatter(medium);
-    }
-
-    static bool may_scatter(const Medium *medium) {
-        float albedo[3];
-        return !read(medium, "albedo.value.value", albedo) || albedo[0] != 0 ||
-               albedo[1] != 0 || albedo[2] != 0;
-    }
-
-    static bool may_be_chromatic(const Medium *medium) {
-        if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
-            return false;
-        float sigma[3];
-        return !read(medium, "sigma_t.value.value", sigma) || sigma[0] != sigma[1] ||
-               sigma[0] != sigma[2];
-    }
-
-private:
-    /// A constant coefficient; false if it is none (then "may" it is)
-    static bool read(const Medium *medium, std::string_view name, float out[3]) {
-        ParameterReader params(medium);
-        if (const Float *value = params.find<Float>(name)) {
-            std::fill_n(out, 3, read_scalar(*value));
-            return true;
-        }
-        // In spectral variants the parameters of an upsampled colour tell nothing at a glance
-        const Color *color =
-            mitsuba::is_spectral_v<Spectrum> ? nullptr : params.find<Color>(name);
-        for (size_t i = 0; color && i < 3; ++i)
-            out[i] = read_scalar(color->entry(i % dr::size_v<Color>));
-        return color != nullptr;
-    }
-};
-
 template <typename Float, typename Spectrum> class Media {
 public:
-    MI_IMPORT_TYPES(Scene, Sampler, BSDFPtr, Medium, MediumPtr)
+    MI_IMPORT_TYPES(Scene, Sampler, BSDFPtr, MediumPtr)
     using Rng = dr::PCG32<dr::uint32_array_t<dr::detached_t<Float>>>;
-
-    /// The media of the scene's shapes, within groups, too, and of its sensors
-    static MediaKinds find(const Scene *scene) {
-        MediaKinds kinds;
-        using Reader = MediumReader<Float, Spectrum>;
-        for_each_shape(scene, [&](const auto *shape) {
-            Reader::add(kinds, shape->interior_medium());
-            Reader::add(kinds, shape->exterior_medium());
-        });
-        for (const auto &sensor : scene->sensors())
-            Reader::add(kinds, sensor->medium());
-        return kinds;
-    }
-
-    /// The same with the medium that a caller of `sample()` starts in
-    static MediaKinds with(MediaKinds kinds, const Scene *scene, const Medium *medium) {
-        bool known = !medium;
-        for (const auto &sensor : scene->sensors())
-            known |= sensor->medium() == medium;
-        if (!known)
-            MediumReader<Float, Spectrum>::add(kinds, medium);
-        return kinds;
-    }
 
     Media(const Scene *scene, const MediaKinds &kinds) : m_scene(scene), m_kinds(kinds) {}
 

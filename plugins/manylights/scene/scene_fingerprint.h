@@ -1,7 +1,7 @@
 #pragma once
 
 #include "fingerprint.h"
-#include "media.h"
+#include "media_kinds.h"
 #include "scene_lobes.h"
 
 namespace manylights {
@@ -33,7 +33,7 @@ Fingerprint<Float> scene_fingerprint(const mitsuba::Scene<Float, Spectrum> *scen
     }
     // The same emitters may belong to another scene: a new one that lies in memory
     // where a deleted one lay
-    MediaKinds media = Media<Float, Spectrum>::find(scene);
+    MediaKinds media = MediumReader<Float, Spectrum>::find(scene);
     result.mix_common((uint32_t) find_lobes<Float, Spectrum>(scene) + 4 * media.bits());
     return result;
 }

@@ -5,7 +5,7 @@
  * map from a hit to its light.
  */
 
-#include "media.h"
+#include "media_kinds.h"
 #include "refit.h"
 #include "scene_lobes.h"
 #include "visibility_learner.h"
@@ -47,7 +47,7 @@ public:
         m_first_only_hit     = table.first_only_hit;
         m_tree.set_scale(table.scale);
         m_lobes            = find_lobes<Float, Spectrum>(scene);
-        m_media            = Media<Float, Spectrum>::find(scene);
+        m_media            = MediumReader<Float, Spectrum>::find(scene);
         m_tree.light_count = (uint32_t) table.rows.size();
 
         HostStorage<Storage> nodes;
