@@ -107,7 +107,7 @@ def test_hidden_emitter_is_passed_along_its_surface(scalar):
 # ------------------------------------------------------------------------------------ quadrature
 
 
-LARGEST = 1 << 11
+LARGEST = 1 << 13
 """Samples per pixel at most: noisy scenes do not hold up the others."""
 
 

@@ -279,11 +279,19 @@ private:
     /// Fills `si` where a surface lets light pass straight on, and returns where that is
     Mask find_border(const Ray3f &ray, PreliminaryIntersection3f &pi,
                      SurfaceInteraction3f &si, Mask hit) const {
-        Mask passes = false;
-        if (dr::any_or<true>(hit))
-            passes = hit && has_flag(pi.shape->bsdf()->flags(), mitsuba::BSDFFlags::Null);
+        constexpr auto null = mitsuba::BSDFFlags::Null;
+        // Which shape of an instance was hit is not known yet
+        Mask instance = false, passes = false;
+        if (!m_scene->shapegroups().empty())
+            instance = hit && pi.shape == nullptr;
+        Mask known = hit && !instance;
+        if (dr::any_or<true>(known))
+            passes = known && has_flag(pi.shape->bsdf()->flags(), null);
+        passes |= instance;
         if (dr::any_or<true>(passes))
             si = pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, passes);
+        if (dr::any_or<true>(instance))
+            passes &= !instance || has_flag(si.bsdf()->flags(), null);
         return passes;
     }
 

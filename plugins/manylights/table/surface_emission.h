@@ -110,6 +110,8 @@ private:
     Color3f color(const dr::uint32_array_t<Float> &primitive, const Point2f &uv,
                   const Point3f &p) const {
         PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
+        pi.valid                     = true;
+        pi.t                         = 0.f; // zeros() has infinity
         pi.prim_uv                   = uv;
         pi.prim_index                = primitive;
         pi.shape                     = m_shape;
