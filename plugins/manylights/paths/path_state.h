@@ -28,6 +28,8 @@ template <typename Float, typename Spectrum> struct PathState {
     using FloatD = dr::detached_t<Float>;
 
     Mask active, valid;
+    /// Did a last flight end in fog? Alpha does not count what its exact transmittance shows
+    Mask ended;
     UInt32 depth;
     Ray3f ray;
     PreliminaryIntersection3f pi;
@@ -41,11 +43,11 @@ template <typename Float, typename Spectrum> struct PathState {
     Mask specular;
     Counts<Float> counts;
     Sampler *sampler;
-    DRJIT_STRUCT(PathState, active, valid, depth, ray, pi, medium, throughput, result,
-                 eta, from, u_tree, pdf, specular, counts, sampler)
+    DRJIT_STRUCT(PathState, active, valid, ended, depth, ray, pi, medium, throughput,
+                 result, eta, from, u_tree, pdf, specular, counts, sampler)
 
     PathState(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
-        : active(active), valid(false), depth(0), ray(ray), medium(medium),
+        : active(active), valid(false), ended(false), depth(0), ray(ray), medium(medium),
           throughput(1.f), result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()),
           u_tree(0.f), pdf(1.f), specular(true), sampler(sampler) {}
 };

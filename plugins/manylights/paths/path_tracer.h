@@ -89,7 +89,7 @@ private:
         BSDFPtr bsdf = bsdf_of(si, surface);
         Mask goes_on = ends_there && (!m_limits.is_last(s.depth) ||
                                       can_pass(bsdf, ends_there) || piece.hidden);
-        s.valid |= ends_there && !goes_on;
+        s.valid |= ends_there && !goes_on && !s.ended;
         s.active &= piece.scattered || goes_on;
         if (dr::none_or<false>(s.active))
             return;
@@ -129,7 +129,7 @@ private:
                                                light, active && !s.specular);
         Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
         add(s, radiance * dr::detach(weight), piece, active);
-        s.valid |= active && light != kNone;
+        s.valid |= active && light != kNone && !s.ended;
     }
 
     /// Single scattering along a whole piece of the path, whatever its flight
@@ -187,7 +187,7 @@ private:
             s.throughput *= piece.weight;
         s.eta *= next.eta;
         Mask counts = !next.null;
-        s.valid |= s.active && counts;
+        s.valid |= s.active && counts && !s.ended;
         // Where null surfaces are no vertices, what light sampling knows is left in place
         remember(s, vertex, piece, next, m_media ? counts : Mask(true));
         if (m_media) {

@@ -61,9 +61,10 @@ public:
             piece.weight    = dr::select(within, flight.weight, 1.f);
             Mask exact      = within && passes_exactly(s, within);
             s.active &= !(flight.scattered && within) || piece.scattered || exact;
+            s.valid |= piece.scattered;
+            s.ended |= exact && flight.scattered && m_limits.is_last(s.depth);
             if (m_homogeneous)
                 take_exact(s, piece, exact);
-            s.valid |= piece.scattered;
             piece.seen = piece.weight;
             if (m_segments)
                 find_segment(s, piece, within);
