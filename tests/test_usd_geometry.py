@@ -78,7 +78,7 @@ def test_polygons_of_any_shape_have_their_area(points, expected, turn):
     assert np.linalg.norm(area_vectors(surface).sum(axis=0)) == pytest.approx(expected, rel=1e-6)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, derandomize=True, database=None, max_examples=60)
 @given(
     st.lists(st.floats(0.1, 1), min_size=3, max_size=24),
     st.floats(-3, 3),
@@ -152,7 +152,7 @@ def usd_list(rows):
 
 @pytest.mark.parametrize("interpolation", COUNTS)
 @pytest.mark.parametrize("indexed", [False, True])
-@settings(deadline=None, max_examples=12)
+@settings(deadline=None, derandomize=True, database=None, max_examples=12)
 @given(data=st.data())
 def test_primvars_of_every_interpolation_reach_their_corners(interpolation, indexed, data):
     count = COUNTS[interpolation]
@@ -574,7 +574,7 @@ def text_of(value):
     return repr(value)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, derandomize=True, database=None, max_examples=50)
 @given(
     values=st.fixed_dictionaries(
         {
@@ -615,7 +615,7 @@ def test_no_mesh_breaks_the_reader(values, scheme, interpolation, color, valid):
         assert surface.colors is None or np.isfinite(surface.colors).all()
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, derandomize=True, database=None, max_examples=60)
 @given(
     counts=st.lists(st.integers(-1, 8), max_size=3),
     places=points,

@@ -97,7 +97,8 @@ def _pieces(counts: np.ndarray, linear: bool, basis: str, wrap: str) -> Pieces:
             phantoms.append(indices[:, [0, 1, -1, -2]].reshape(-1, 2))
             indices = np.concatenate([first[:, None], indices, first[:, None] + 1], axis=1)
         if periodic:
-            indices = np.concatenate([indices, indices[:, : width - step]], axis=1)
+            # Modulo: two points of a B-spline are gone round more than once
+            indices = indices[:, np.arange(count + width - step) % count]
         places = step * np.arange(number)[:, None] + np.arange(width)
         parts.append(indices[:, places].reshape(-1, width))
         along = (np.arange(number)[:, None] + np.arange(2)) % values[chosen[0]]
