@@ -203,6 +203,36 @@ def test_white_fog_of_one_part_of_the_spectrum(variant):
     tools.assert_same_mean(images, bare, label="white fog")
 
 
+@pytest.mark.parametrize(
+    "variant, kind",
+    [("scalar_rgb", "homogeneous"), ("llvm_ad_rgb", "heterogeneous")],
+    indirect=["variant"],
+)
+def test_colourful_fog_of_many_collisions(variant, kind):
+    """White fog under a white sky: weights stay small, however many collisions a path has.
+
+    No weight exceeds the three channels. Where each step chose its channel anew they grew from
+    step to step, and samples had a standard deviation of 9.
+    """
+    sigma, spp = (0.5, 2.0, 4.0), 640
+    grid = path_scenes.grid(np.broadcast_to(sigma, (2, 2, 2, 3)), (-1, -1, -1), (1, 1, 1))
+    color = path_scenes.rgb([0.1 * value for value in sigma])
+    medium = {
+        "homogeneous": {"type": "homogeneous", "sigma_t": color, "scale": 10.0, "albedo": 1.0},
+        "heterogeneous": path_scenes.heterogeneous(grid, 1.0, scale=1.0),
+    }[kind]
+    scene = {
+        "type": "scene",
+        "sky": {"type": "constant", "radiance": 1.0},
+        "fog": {"type": "cube", "bsdf": NULL, "interior": medium},
+        "sensor": camera((0, 0, 5), (0, 0, 0), fov=5, up=(0, 1, 0)),
+    }
+    loaded = mi.load_dict(scene)
+    images = tools.render_seeds(loaded, light_tree(rr_depth=1000), spp=spp, seeds=range(64))
+    assert_exact(images, 1.0, label=f"{kind}, {variant}")
+    assert (images.std(axis=(0, 1, 2)) * np.sqrt(spp) < 2.5).all()
+
+
 # --------------------------------------------------------------------------- what need not be noise
 
 

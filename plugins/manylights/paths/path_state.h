@@ -35,6 +35,8 @@ template <typename Float, typename Spectrum> struct PathState {
     PreliminaryIntersection3f pi;
     MediumPtr medium;
     Spectrum throughput, result;
+    /// Of the flights so far, for each channel, over their mean (scene/media.h)
+    UnpolarizedSpectrum densities;
     Float eta;
     /// The vertex before, for the density of finding its lights by chance
     Receiver<FloatD> from;
@@ -44,12 +46,13 @@ template <typename Float, typename Spectrum> struct PathState {
     Counts<Float> counts;
     Sampler *sampler;
     DRJIT_STRUCT(PathState, active, valid, ended, depth, ray, pi, medium, throughput,
-                 result, eta, from, u_tree, pdf, specular, counts, sampler)
+                 result, densities, eta, from, u_tree, pdf, specular, counts, sampler)
 
     PathState(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
         : active(active), valid(false), ended(false), depth(0), ray(ray), medium(medium),
-          throughput(1.f), result(0.f), eta(1.f), from(dr::zeros<Receiver<FloatD>>()),
-          u_tree(0.f), pdf(1.f), specular(true), sampler(sampler) {}
+          throughput(1.f), result(0.f), densities(1.f), eta(1.f),
+          from(dr::zeros<Receiver<FloatD>>()), u_tree(0.f), pdf(1.f), specular(true),
+          sampler(sampler) {}
 };
 
 } // namespace manylights

@@ -55,11 +55,14 @@ public:
         piece.u_tree = 0.f;
         Mask within  = s.active && s.medium != nullptr;
         if (dr::any_or<true>(within)) {
-            auto flight     = m_media.fly(s.medium, s.ray, s.pi.t, s.sampler, within);
+            auto flight =
+                m_media.fly(s.medium, s.ray, s.pi.t, s.densities, s.sampler, within);
             inside.mei      = flight.mei;
             piece.scattered = within && flight.scattered && !m_limits.is_last(s.depth);
             piece.weight    = dr::select(within, flight.weight, 1.f);
             Mask exact      = within && passes_exactly(s, within);
+            if (m_media.kinds().chromatic)
+                dr::masked(s.densities, within && !exact) = flight.densities;
             s.active &= !(flight.scattered && within) || piece.scattered || exact;
             s.valid |= piece.scattered;
             s.ended |= exact && flight.scattered && m_limits.is_last(s.depth);

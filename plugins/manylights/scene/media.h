@@ -35,12 +35,15 @@ public:
         Mask scattered;
         /// Transmittance times scattering coefficient (if it scattered), over the density
         UnpolarizedSpectrum weight;
-        DRJIT_STRUCT(Flight, mei, scattered, weight)
+        /// \ref collide
+        UnpolarizedSpectrum densities;
+        DRJIT_STRUCT(Flight, mei, scattered, weight, densities)
     };
 
     /// Sample a flight over at most `distance`; lanes that are not `active` stay put
     Flight fly(const MediumPtr &medium, const Ray3f &ray, const Float &distance,
-               Sampler *sampler, Mask active) const {
+               const UnpolarizedSpectrum &densities, Sampler *sampler,
+               Mask active) const {
         struct State {
             Mask active;
             Ray3f ray;
@@ -50,11 +53,12 @@ public:
             DRJIT_STRUCT(State, active, ray, distance, flight, sampler)
         };
         State state{ active, ray, distance, dr::zeros<Flight>(), sampler };
-        state.flight.weight = UnpolarizedSpectrum(1.f);
-        auto step           = [&](State &s) {
-            Collision c = collide(medium, s.ray, s.distance, s.sampler->next_1d(s.active),
-                                  s.active);
-            Float null_probability = dr::detach(dr::mean(c.null_fraction));
+        state.flight.weight    = UnpolarizedSpectrum(1.f);
+        state.flight.densities = densities;
+        auto step              = [&](State &s) {
+            Collision c = collide(medium, s.ray, s.distance, s.flight.densities,
+                                  s.sampler->next_1d(s.active), s.active);
+            Float null_probability = dr::mean(c.densities * c.null_fraction);
             Mask null = c.hit && m_kinds.heterogeneous &&
                         (m_kinds.heterogeneous ? s.sampler->next_1d(s.active)
                                                : Float(1.f)) < null_probability;
@@ -65,6 +69,13 @@ public:
                     dr::select(c.hit, c.mei.sigma_s / (1.f - null_probability), 1.f));
             dr::masked(s.flight.weight, s.active) = s.flight.weight * factor;
             dr::masked(s.flight.mei, s.active)    = c.mei;
+            if (m_kinds.chromatic) {
+                UnpolarizedSpectrum event = dr::select(
+                    null, c.null_fraction / null_probability,
+                    dr::select(c.hit, (1.f - c.null_fraction) / (1.f - null_probability),
+                               1.f));
+                dr::masked(s.flight.densities, s.active) = c.densities * event;
+            }
             s.flight.scattered |= s.active && c.hit && !null;
             s.active &= null;
             dr::masked(s.ray.o, s.active)    = c.mei.p;
@@ -164,26 +175,27 @@ private:
         /// Transmittance over the density of the distance
         UnpolarizedSpectrum weight;
         UnpolarizedSpectrum null_fraction;
+        UnpolarizedSpectrum densities;
     };
 
     /**
-     * One step of tracking. Where the extinction varies between wavelengths or channels, the
-     * distance follows the majorant of a random one, and its density is the mean of all: no
-     * weight exceeds their number. The distance is not differentiated, what is evaluated there
-     * is.
+     * One step of tracking. Where the extinction varies between wavelengths or channels, a
+     * random one is followed, its majorant and its chance of a null collision. The density of
+     * a path is the mean of those that each of them would have given *all* of it (spectral
+     * MIS), so that no weight exceeds their number, however many collisions there are.
+     *
+     * @param densities  of the path so far, for each channel, over their mean: the chances of
+     *                   channels to be followed. They are not differentiated, nor is the
+     *                   distance; what is evaluated there is.
      */
-    Collision collide(const MediumPtr &medium, Ray3f ray, const Float &distance, Float u,
-                      Mask active) const {
+    Collision collide(const MediumPtr &medium, Ray3f ray, const Float &distance,
+                      const UnpolarizedSpectrum &densities, Float u, Mask active) const {
         UInt32 channel(0);
-        if (m_kinds.chromatic) {
-            constexpr uint32_t count = dr::size_v<UnpolarizedSpectrum>;
-            channel                  = dr::minimum(UInt32(u * (float) count), count - 1);
-            u                        = dr::minimum(u * (float) count - Float(channel),
-                                                   dr::OneMinusEpsilon<Float>);
-        }
+        if (m_kinds.chromatic_majorants)
+            std::tie(channel, u) = choose_channel(densities, u);
         ray.maxt = distance;
-        Collision c{ medium->sample_interaction(ray, u, channel, active), false, 0.f,
-                     0.f };
+        Collision c{ medium->sample_interaction(ray, u, channel, active), false, 0.f, 0.f,
+                     densities };
         Float end = distance;
         if (m_kinds.heterogeneous) {
             // The medium may end before the surface does, or be missed
@@ -192,7 +204,7 @@ private:
             end = dr::select(met, dr::minimum(distance, far), c.mei.mint);
         }
         if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            if (m_kinds.chromatic)
+            if (m_kinds.chromatic_majorants)
                 follow_channel(c.mei, medium, ray, end, u, channel, active);
         c.mei.t = dr::detach(c.mei.t);
         c.mei.p = dr::detach(c.mei.p);
@@ -203,10 +215,32 @@ private:
         Float length =
             dr::clip(dr::minimum(c.mei.t, end) - c.mei.mint, 0.f, dr::Largest<Float>);
         UnpolarizedSpectrum tr = dr::exp(-length * majorant);
-        Float density   = dr::detach(dr::mean(dr::select(c.hit, tr * majorant, tr)));
-        c.weight        = dr::select(density > 0.f, tr / density, 0.f);
-        c.null_fraction = dr::select(majorant > 0.f, c.mei.sigma_n / majorant, 0.f);
+        c.densities   = dr::detach(densities * dr::select(c.hit, tr * majorant, tr));
+        Float density = dr::mean(c.densities);
+        Mask possible = density > 0.f;
+        c.weight      = dr::select(possible, tr / density, 0.f);
+        c.densities   = dr::select(possible, c.densities / density, 1.f);
+        // Extinctions may exceed a grid's majorant by rounding
+        c.null_fraction = dr::detach(dr::clip(
+            dr::select(majorant > 0.f, c.mei.sigma_n / majorant, 0.f), 0.f, 1.f));
         return c;
+    }
+
+    /// A channel, chosen by its density, and the number u used again
+    static std::pair<UInt32, Float> choose_channel(const UnpolarizedSpectrum &densities,
+                                                   const Float &u) {
+        Float target = u * dr::sum(densities), below(0.f), begin(0.f), share(1.f);
+        UInt32 channel(0);
+        for (uint32_t i = 0; i < dr::size_v<UnpolarizedSpectrum>; ++i) {
+            Float density                = densities.entry(i);
+            Mask reached                 = target >= below && density > 0.f;
+            dr::masked(channel, reached) = i;
+            dr::masked(begin, reached)   = below;
+            dr::masked(share, reached)   = density;
+            below += density;
+        }
+        return { channel,
+                 dr::clip((target - begin) / share, 0.f, dr::OneMinusEpsilon<Float>) };
     }
 
     /// A collision at the distance that a wavelength chooses: Mitsuba takes the first one
@@ -255,18 +289,26 @@ private:
             Mask active;
             Ray3f ray;
             Float distance;
-            UnpolarizedSpectrum result;
+            UnpolarizedSpectrum result, densities;
             Rng rng;
-            DRJIT_STRUCT(State, active, ray, distance, result, rng)
+            DRJIT_STRUCT(State, active, ray, distance, result, densities, rng)
         };
-        State state{ active, ray, distance, UnpolarizedSpectrum(1.f), std::move(rng) };
+        State state{ active,
+                     ray,
+                     distance,
+                     UnpolarizedSpectrum(1.f),
+                     UnpolarizedSpectrum(1.f),
+                     std::move(rng) };
         loop(
             state, [](const State &s) { return s.active; },
             [&](State &s) {
-                Float u     = s.rng.template next_float<dr::detached_t<Float>>();
-                Collision c = collide(medium, s.ray, s.distance, u, s.active);
+                Float u = s.rng.template next_float<dr::detached_t<Float>>();
+                Collision c =
+                    collide(medium, s.ray, s.distance, s.densities, u, s.active);
                 dr::masked(s.result, s.active) =
                     s.result * c.weight * dr::select(c.hit, c.mei.sigma_n, 1.f);
+                if (m_kinds.chromatic)
+                    dr::masked(s.densities, s.active) = c.densities;
                 s.active &= c.hit && dr::any(s.result != 0.f);
                 dr::masked(s.ray.o, s.active)    = c.mei.p;
                 dr::masked(s.distance, s.active) = s.distance - c.mei.t;

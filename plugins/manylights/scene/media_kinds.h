@@ -7,17 +7,20 @@
 #include <mitsuba/render/medium.h>
 #include <mitsuba/render/scene.h>
 #include <mitsuba/render/sensor.h>
+#include <mitsuba/render/volume.h>
 
 namespace manylights {
 
 struct MediaKinds {
     bool any = false, homogeneous = false, heterogeneous = false;
-    /// Does the extinction of any vary with the wavelength? Do homogeneous ones scatter?
-    bool chromatic = false, scattering = false;
+    /// Does the extinction of any vary with the wavelength? Its majorant, too?
+    bool chromatic = false, chromatic_majorants = false;
+    /// Do homogeneous ones scatter?
+    bool scattering = false;
 
     uint32_t bits() const {
         return any + 2 * homogeneous + 4 * heterogeneous + 8 * chromatic +
-               16 * scattering;
+               16 * scattering + 32 * chromatic_majorants;
     }
 };
 
@@ -25,6 +28,7 @@ struct MediaKinds {
 template <typename Float, typename Spectrum> struct MediumReader {
     using Medium = mitsuba::Medium<Float, Spectrum>;
     using Scene  = mitsuba::Scene<Float, Spectrum>;
+    using Volume = mitsuba::Volume<Float, Spectrum>;
     using Color  = mitsuba::Color<Float, mitsuba::is_monochromatic_v<Spectrum> ? 1 : 3>;
 
     /// The media of the scene's shapes, within groups, too, and of its sensors
@@ -55,9 +59,11 @@ template <typename Float, typename Spectrum> struct MediumReader {
         kinds.any        = true;
         bool homogeneous = medium->is_homogeneous();
         (homogeneous ? kinds.homogeneous : kinds.heterogeneous) = true;
+        bool chromatic = may_be_chromatic(medium);
+        kinds.chromatic |= chromatic;
         // The majorant of Mitsuba's heterogeneous media is a single number
-        if (homogeneous || medium->class_name() != "HeterogeneousMedium")
-            kinds.chromatic |= may_be_chromatic(medium);
+        kinds.chromatic_majorants |=
+            chromatic && medium->class_name() != "HeterogeneousMedium";
         if (homogeneous && !kinds.scattering)
             kinds.scattering = may_scatter(medium);
     }
@@ -70,6 +76,10 @@ template <typename Float, typename Spectrum> struct MediumReader {
 
     static bool may_be_chromatic(const Medium *medium) {
         if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
+            return false;
+        auto *grid =
+            dynamic_cast<const Volume *>(ParameterReader(medium).object("sigma_t"));
+        if (grid && grid->class_name() == "GridVolume" && grid->channel_count() == 1)
             return false;
         float sigma[3];
         return !read(medium, "sigma_t.value.value", sigma) || sigma[0] != sigma[1] ||
