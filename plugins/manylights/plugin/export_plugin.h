@@ -4,10 +4,11 @@
  * Registration of a plugin that is compiled for some of Mitsuba's variants only.
  *
  * Mitsuba's MI_EXPORT_PLUGIN instantiates a plugin for all variants in one translation
- * unit, which takes minutes and gigabytes. Here the build compiles a plugin's source file
- * once for every chosen variant, with MANYLIGHTS_VARIANT set to the name of the variant,
- * and each of these translation units adds itself to a list when the plugin is loaded.
- * init_plugin.cpp hands the list to Mitsuba.
+ * unit, which takes minutes and gigabytes. Here the build compiles one translation unit for
+ * every chosen variant, with MANYLIGHTS_VARIANT set to the name of the variant. It includes
+ * the source files of all plugins, since most of their templates are the same, with
+ * MANYLIGHTS_PLUGIN set to the name of each. The plugins add themselves to a list when
+ * libmanylights is loaded, which has all of them; init_plugin.cpp hands the list to Mitsuba.
  */
 
 #include <mitsuba/core/object.h>
@@ -53,20 +54,22 @@ using cuda_ad_spectral_polarized = Variant<CUDA, Mueller<Spectral<CUDA>>>;
 
 /// What Mitsuba has to know about a plugin in one variant
 struct CompiledVariant {
+    std::string_view plugin;
     std::string_view variant;
     mitsuba::ObjectType type;
     mitsuba::PluginInstantiateFn instantiate;
 };
 
-/// The variants of this plugin, in no particular order; filled while the file is loaded
+/// All plugins in all variants, in no particular order; filled while the library is loaded
 std::vector<CompiledVariant> &compiled_variants();
 
 /// Adds the class Plugin, an instance of a plugin's template, to the list
-template <typename Plugin, typename Variant> bool add_compiled_variant() {
+template <typename Plugin, typename Variant>
+bool add_compiled_variant(std::string_view plugin) {
     auto instantiate = [](void *, const mitsuba::Properties &props) {
         return mitsuba::ref<mitsuba::Object>(new Plugin(props));
     };
-    compiled_variants().push_back({ Variant::name, Plugin::Type, instantiate });
+    compiled_variants().push_back({ plugin, Variant::name, Plugin::Type, instantiate });
     return true;
 }
 
@@ -74,8 +77,8 @@ template <typename Plugin, typename Variant> bool add_compiled_variant() {
 
 /// Ends the source file of a plugin; Name is its class template
 #define MANYLIGHTS_EXPORT_PLUGIN(Name)                                                   \
-    [[maybe_unused]] static const bool manylights_registered =                           \
+    [[maybe_unused]] static const bool Name##_registered =                               \
         ::manylights::add_compiled_variant<                                              \
             Name<::manylights::variants::MANYLIGHTS_VARIANT::Float,                      \
                  ::manylights::variants::MANYLIGHTS_VARIANT::Spectrum>,                  \
-            ::manylights::variants::MANYLIGHTS_VARIANT>();
+            ::manylights::variants::MANYLIGHTS_VARIANT>(MANYLIGHTS_PLUGIN);

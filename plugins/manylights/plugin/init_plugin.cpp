@@ -1,5 +1,5 @@
 /**
- * The entry point that Mitsuba looks for in a plugin; see export_plugin.h.
+ * The entry point that Mitsuba looks for in each plugin; see export_plugin.h.
  *
  * It refuses to work with a Mitsuba of another ABI, since the alternative is a crash, and
  * it answers for the variants that were not compiled with a message that says how to get
@@ -45,10 +45,19 @@ void check_abi(const std::string &plugin) {
             "pip install --force-reinstall --no-deps \"mitsuba==" MI_VERSION "\"");
 }
 
+/// One plugin in the variants that were compiled
+std::vector<CompiledVariant> compiled_variants_of(std::string_view plugin) {
+    std::vector<CompiledVariant> result;
+    for (const CompiledVariant &compiled : compiled_variants())
+        if (compiled.plugin == plugin)
+            result.push_back(compiled);
+    return result;
+}
+
 /// Stands in for the instantiation of a plugin in a variant that was not compiled
 template <typename Variant> ref<Object> refuse(void *, const Properties &props) {
     std::string available;
-    for (const CompiledVariant &compiled : compiled_variants())
+    for (const CompiledVariant &compiled : compiled_variants_of(props.plugin_name()))
         available += (available.empty() ? "" : ",") + std::string(compiled.variant);
     throw std::runtime_error(
         "The plugin \"" + std::string(props.plugin_name()) +
@@ -58,20 +67,26 @@ template <typename Variant> ref<Object> refuse(void *, const Properties &props) 
 }
 
 template <typename Variant>
-void register_variant(std::string_view plugin, PluginRegisterFn register_plugin) {
+void register_variant(const std::vector<CompiledVariant> &compiled_variants,
+                      PluginRegisterFn register_plugin) {
     // A plugin has one type in all variants. Mitsuba asks for it before it knows which
     // variant to use.
-    CompiledVariant entry = { Variant::name, compiled_variants().front().type,
-                              refuse<Variant> };
-    for (const CompiledVariant &compiled : compiled_variants())
+    CompiledVariant entry = compiled_variants.front();
+    entry.variant         = Variant::name;
+    entry.instantiate     = refuse<Variant>;
+    for (const CompiledVariant &compiled : compiled_variants)
         if (compiled.variant == entry.variant)
             entry = compiled;
-    register_plugin(plugin, entry.variant, entry.type, entry.instantiate);
+    register_plugin(entry.plugin, entry.variant, entry.type, entry.instantiate);
 }
 
 template <typename... Variants>
 void register_variants(std::string_view plugin, PluginRegisterFn register_plugin) {
-    (register_variant<Variants>(plugin, register_plugin), ...);
+    const std::vector<CompiledVariant> compiled = compiled_variants_of(plugin);
+    if (compiled.empty())
+        throw std::runtime_error("manylights has no plugin \"" + std::string(plugin) +
+                                 "\".");
+    (register_variant<Variants>(compiled, register_plugin), ...);
 }
 
 } // namespace
