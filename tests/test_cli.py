@@ -12,7 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import __version__, cli, loading, rendering
+from manylights import __version__, cli, loading, plugin_dir, rendering
 from manylights.errors import UsageError
 from manylights.loading import integrators
 from manylights.progress import Estimate, format_seconds
@@ -570,6 +570,16 @@ def test_debug_shows_the_traceback(tmp_path):
 
 def test_version():
     assert manylights("--version").stdout.strip() == __version__
+    lines = manylights("--verbose", "--version").stdout.splitlines()
+    told = dict(line.split(":", 1) for line in lines)
+    assert mi.__version__ in told["Mitsuba"] and told["plugins"].strip() == plugin_dir()
+    variants = told["variants"].strip().split(", ")
+    assert "scalar_rgb" in variants and set(variants) <= set(mi.variants())
+
+
+def test_no_command():
+    process = manylights()
+    assert process.returncode == 2 and "COMMAND" in process.stderr
 
 
 @pytest.mark.parametrize("spp", [1, 3, 16, 100, 1000])

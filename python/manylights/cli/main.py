@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 
-from manylights.cli import bench, compare, convert, demo, render, report, tree
+from manylights.cli import bench, compare, convert, demo, render, report, tree, version
 from manylights.errors import one_line
 from manylights.progress import INTERRUPTED
 
@@ -25,7 +25,13 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: what follows the command's name. Default: what the process was started with.
     """
-    options = parser().parse_args(arguments)
+    made = parser()
+    options = made.parse_args(arguments)
+    if options.version:
+        print(version.describe(options.verbose))
+        return 0
+    if options.command is None:
+        made.error("which COMMAND? One of those that `manylights --help` lists")
     try:
         return options.command(options) or 0
     except KeyboardInterrupt:
@@ -43,15 +49,17 @@ def main(arguments: list[str] | None = None) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands; what it parses has the function ``command``."""
-    from manylights import __version__
-
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     made = argparse.ArgumentParser(
         prog="manylights", description="Renders scenes with very many lights."
     )
-    made.add_argument("--version", action="version", version=__version__)
-    commands = made.add_subparsers(metavar="COMMAND", required=True)
+    made.add_argument("--version", action="store_true", help="print the version")
+    made.add_argument(
+        "--verbose", action="store_true", help="with --version: versions, variants, LLVM, CPU, GPU"
+    )
+    made.set_defaults(command=None)
+    commands = made.add_subparsers(metavar="COMMAND")
     folder = commands.add_parser(
         "plugin-dir", parents=[common], help='print the folder for: mitsuba -a "$(...)" scene.xml'
     )
