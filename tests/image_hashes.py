@@ -4,8 +4,9 @@
     python -m tests.image_hashes --compare before.json
 
 All scene files and some generators are rendered small, with both integrators, all methods, with and
-without learning, on one thread. Compare builds with the same compiler and flags: where calls are
-inlined differently, scalar variants may round the last bits differently.
+without learning, on one thread. In JIT variants the kernels of each image are compared, too: how
+many there are, and the operations that they consist of. Compare builds with the same compiler and
+flags: where calls are inlined differently, scalar variants may round the last bits differently.
 """
 
 from __future__ import annotations
@@ -55,10 +56,18 @@ def scenes() -> dict:
     return found
 
 
+def kernels(history: list[dict]) -> str:
+    """The number of kernels that ran, and the operations of all of them."""
+    ran = [each for each in history if each["type"] == dr.KernelType.JIT]
+    return f"{len(ran)} kernels of {sum(each['operation_count'] for each in ran)} operations"
+
+
 def hashes(variant: str) -> dict[str, str]:
-    """SHA-256 of each image, by scene and parameters."""
+    """SHA-256 of each image and its kernels, by scene and parameters."""
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
+    jit = not variant.startswith("scalar")
+    dr.set_flag(dr.JitFlag.KernelHistory, jit)
     result = {}
     for name, load in scenes().items():
         # With one thread Mitsuba waits for ever for some files
@@ -68,7 +77,10 @@ def hashes(variant: str) -> dict[str, str]:
         for plugin in ("manylights_direct", "manylights_volpath"):
             for each in settings(plugin):
                 key = " ".join([variant, name, *(str(value) for value in each.values())])
+                dr.kernel_history_clear()
                 image = np.array(mi.render(scene, integrator=mi.load_dict(each), spp=4, seed=1))
+                if jit:
+                    result[f"{key}: kernels"] = kernels(dr.kernel_history())
                 result[key] = hashlib.sha256(np.ascontiguousarray(image)).hexdigest()
         print(variant, name, file=sys.stderr, flush=True)
     return result
@@ -89,9 +101,11 @@ def main() -> int:
     if not options.compare:
         return 0
     before = json.loads(Path(options.compare).read_text())
-    changed = [key for key, value in found.items() if before.get(key) != value]
-    print(*(f"differs: {key}" for key in changed), sep="\n")
-    print(f"{len(found) - len(changed)} of {len(found)} images are the same")
+    # A file of an older version may have no kernels
+    known = {key: value for key, value in found.items() if key in before or "kernels" not in key}
+    changed = [key for key, value in known.items() if before.get(key) != value]
+    print(*(f"differs: {key}: {before.get(key)}, {found[key]}" for key in changed), sep="\n")
+    print(f"{len(known) - len(changed)} of {len(known)} images and numbers of kernels are the same")
     return int(bool(changed))
 
 

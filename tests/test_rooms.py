@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.cpp_blocks import blocks
+
 PACKAGE = Path(__file__).parents[1] / "python" / "manylights"
 
 #: Each room imports at its top only those before it, and itself.
@@ -81,8 +83,8 @@ def test_no_two_classes_have_one_name():
 PLUGINS = PACKAGE.parents[1] / "plugins" / "manylights"
 
 #: Folders of the C++, in the order of the data: each includes only those before it, and itself.
-FOLDERS = ("base", "table", "receiver", "learning", "tree", "choice", "scene", "direct", "paths")
-FOLDERS += ("render", "plugin")
+FOLDERS = ("base", "emission", "kinds", "table", "receiver", "learning", "tree", "choice", "scene")
+FOLDERS += ("direct", "paths", "render", "plugin")
 
 INCLUDE = re.compile(r'#include ["<]manylights/(\w+)/')
 
@@ -114,3 +116,51 @@ def test_folders_include_only_those_before_them():
 def test_an_include_of_a_later_folder_is_found():
     wrong = '#include "manylights/direct/vertex.h"\n#include "manylights/base/loop.h"'
     assert includes_that_climb([("tree", wrong)]) == {("tree", "direct")}
+
+
+#: The most lines that each may have.
+LONGEST = {"class": 300, "function": 60}
+
+
+def too_long(text):
+    """Return classes and functions of a C++ file that are too long."""
+    return [block for block in blocks(text) if block.length > LONGEST[block.kind]]
+
+
+def cpp_files():
+    """Return all files of the plugins."""
+    return sorted(path for path in PLUGINS.parent.rglob("*") if path.suffix in (".h", ".cpp"))
+
+
+@pytest.mark.parametrize("path", cpp_files(), ids=lambda path: path.name)
+def test_cpp_classes_and_functions_are_short(path):
+    assert too_long(path.read_text()) == []
+
+
+def test_cpp_classes_and_functions_are_found():
+    """In hard places: initializers, lambdas, braces that are no code, classes with a base."""
+    text = """
+#define OPEN {
+template <typename T> struct alignas(16) A : B<T> {
+    A(int x) : m_x{ x }, m_y(x) {
+        auto f = [&](auto y) { return y; };
+        if (x) { f('{'); } else { f("{"); } // {
+        g([](int) -> int { return 1; });
+    }
+    int h() const noexcept { return m_x; }
+    int m_x{ 1 }, m_y = { 2 };
+};
+enum class E { F };
+namespace n { void last(const C<D> &c = {}) { for (;;) { } } }
+"""
+    found = {(each.kind, each.name): each.length for each in blocks(text)}
+    assert found == {
+        **{("class", "A"): 9, ("function", "A"): 5, ("function", "lambda"): 1},
+        **{("function", "g"): 1, ("function", "h"): 1, ("function", "last"): 1},
+    }
+
+
+@pytest.mark.parametrize("head", ["void f()", "F::F() : m_x{ 1 }", "auto f = [](int)"])
+def test_a_long_function_is_found(head):
+    assert too_long(f"{head} {{\n" + "    ;\n" * 58 + "}\n") == []
+    assert len(too_long(f"{head} {{\n" + "    ;\n" * 59 + "}\n")) == 1

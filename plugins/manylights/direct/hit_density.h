@@ -41,12 +41,10 @@ public:
             dr::suspend_grad<Float> detached;
             const auto &tree = m_lights.tree();
             Row<FloatD> row  = tree.row(light, plain(found));
-            FloatD pdf =
-                by_kind<FloatD>(row, m_lights.table_kinds(), [&](LightKind kind) {
-                    return light_pdf<FloatD>(row, kind, p, plain(hit.p),
-                                             plain(Vector3f(hit.n)));
-                });
-            result = Float(pdf);
+            FloatD pdf = by_kind<FloatD>(row, m_lights.table_kinds(), [&](auto kind) {
+                return kind.pdf(row, p, plain(hit.p), plain(Vector3f(hit.n)));
+            });
+            result     = Float(pdf);
             if (tree.kinds.has(LightKind::Other)) {
                 Mask other = found && row.is(LightKind::Other);
                 if (dr::any_or<true>(other)) {

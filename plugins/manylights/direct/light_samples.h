@@ -21,9 +21,7 @@ template <typename FloatD>
 SegmentDistances<FloatD> distances_to(const TreeView<FloatD> &tree,
                                       const Receiver<FloatD> &at,
                                       const Row<FloatD> &row) {
-    using Look = Appearance<FloatD>;
-    Look light = by_kind<Look>(row, tree.kinds,
-                               [&](LightKind kind) { return appearance(at, row, kind); });
+    Appearance<FloatD> light = appearance(at, row, tree.kinds);
     return { at, light.w, light.variance };
 }
 
@@ -165,8 +163,8 @@ private:
         using LightPointD = LightPoint<FloatD>;
         mitsuba::Point<FloatD, 2> ud(plain(u.x()), plain(u.y()));
         LightPointD point =
-            by_kind<LightPointD>(row, m_lights.table_kinds(), [&](LightKind kind) {
-                return sample_light<FloatD>(row, kind, vertex.at.p, ud);
+            by_kind<LightPointD>(row, m_lights.table_kinds(), [&](auto kind) {
+                return kind.sample(row, vertex.at.p, ud);
             });
         active &= point.pdf > 0.f;
 
@@ -186,7 +184,7 @@ private:
         }
         bool delta_only = !m_lights.can_be_hit();
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
-        Mask delta      = row.is_delta();
+        Mask delta      = is_delta(row, m_lights.table_kinds());
         Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
         return Sample::make(f & active, emission * Float(point.weight) & active,
                             Point3f(point.p), from.p);

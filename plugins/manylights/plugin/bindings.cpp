@@ -6,7 +6,7 @@
  */
 
 #include "manylights/choice/reservoirs.h"
-#include "manylights/table/brightness_map.h"
+#include "manylights/emission/brightness_map.h"
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/pair.h>

@@ -6,7 +6,7 @@
  * two of them, so that one that has only become brighter is told from one that has moved.
  */
 
-#include "manylights/table/emission_reader.h"
+#include "manylights/emission/emission_reader.h"
 #include <algorithm>
 #include <cstring>
 #include <drjit/tensor.h>

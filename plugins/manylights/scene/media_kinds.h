@@ -2,7 +2,7 @@
 
 /// Which participating media a scene has: code for others is not even recorded.
 
-#include "manylights/table/emission_reader.h"
+#include "manylights/emission/emission_reader.h"
 #include "scene_shapes.h"
 #include <mitsuba/render/medium.h>
 #include <mitsuba/render/scene.h>

@@ -5,14 +5,15 @@
  * radiance varies, and of whatever a ray has hit.
  */
 
-#include "manylights/table/light_points.h"
+#include "manylights/emission/surface_hit.h"
+#include "manylights/kinds/kinds.h"
 #include "scene_lights.h"
 
 namespace manylights {
 
 template <typename Float, typename Spectrum> class SceneEmission {
 public:
-    MI_IMPORT_TYPES(Scene, Emitter, EmitterPtr)
+    MI_IMPORT_TYPES(Scene, Emitter, EmitterPtr, Shape)
     using Lights  = SceneLights<Float, Spectrum>;
     using FloatD  = typename Lights::FloatD;
     using UInt32D = typename Lights::UInt32D;
@@ -68,9 +69,8 @@ public:
             return { light, emits };
         Row<FloatD> row = m_lights.tree().row(light, found);
         using VectorD   = mitsuba::Vector<FloatD, 3>;
-        si.n  = by_kind<VectorD>(row, m_lights.table_kinds(), [&](LightKind kind) {
-            return light_normal<FloatD>(row, kind, plain(si.p));
-        });
+        si.n = by_kind<VectorD>(row, m_lights.table_kinds(),
+                                [&](auto kind) { return kind.normal(row, plain(si.p)); });
         si.wi = dr::select(valid, Vector3f(0.f, 0.f, dr::dot(si.n, si.wi)), si.wi);
         return { light, emits };
     }
@@ -131,17 +131,15 @@ public:
                                              const Row<FloatD> &row,
                                              const LightPoint<FloatD> &point,
                                              const Vector3f &d, Mask active) const {
-        EmitterPtr emitter           = emitter_of(row);
-        PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        MaskD swapped                = row[kColor + 1] > 0.f;
-        pi.valid                     = active;
+        EmitterPtr emitter = emitter_of(row);
+        MaskD swapped      = row[kColor + 1] > 0.f;
+        Point2f uv(dr::select(swapped, point.uv.y(), point.uv.x()),
+                   dr::select(swapped, point.uv.x(), point.uv.y()));
         // From close by: a small shape far away is still hit where the point is
-        pi.t          = dr::norm(Point3f(point.p) - from.p) * (1.f / 1024.f);
-        pi.prim_uv    = Point2f(dr::select(swapped, point.uv.y(), point.uv.x()),
-                                dr::select(swapped, point.uv.x(), point.uv.y()));
-        pi.prim_index = row.bits(kColor);
-        pi.shape      = emitter->shape();
-        Ray3f ray(Point3f(point.p) - d * pi.t, d, from.time, from.wavelengths);
+        Float t = dr::norm(Point3f(point.p) - from.p) * (1.f / 1024.f);
+        auto pi =
+            surface_hit<Float, Shape>(emitter->shape(), row.bits(kColor), uv, t, active);
+        Ray3f ray(Point3f(point.p) - d * t, d, from.time, from.wavelengths);
         SurfaceInteraction3f si =
             pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, active);
         return emitter->eval(si, active);

@@ -5,7 +5,7 @@
  */
 
 #include "manylights/base/host_memory.h"
-#include "row.h"
+#include "manylights/kinds/row.h"
 #include <mitsuba/render/emitter.h>
 #include <mitsuba/render/shape.h>
 #include <string>

@@ -11,8 +11,8 @@
  * after they were selected. Emitters at infinity stay out of the table, and so do those
  * without power.
  *
- * A new kind of emitter gets a reader of its own beside point_lights.h, quadrics.h,
- * mesh_lights.h and other_lights.h, and a line in \ref LightTableReader.
+ * A kind of light reads itself (`kinds/`); which emitter is of which kind is decided in
+ * \ref LightTableReader.
  *
  * Emitters and textures are read through Mitsuba's traversal interface, since the classes
  * of its plugins have no headers.
@@ -20,8 +20,6 @@
 
 #include "mesh_lights.h"
 #include "other_lights.h"
-#include "point_lights.h"
-#include "quadrics.h"
 #include <optional>
 
 namespace manylights {
@@ -55,9 +53,8 @@ private:
     /// Hand an emitter to the reader of its class
     void add(const Emitter *emitter, uint32_t index) {
         m_builder.start(index);
-        bool surface          = m_builder.has(mitsuba::EmitterFlags::Surface);
-        bool directional      = m_builder.has(mitsuba::EmitterFlags::DeltaDirection);
-        std::string_view name = emitter->class_name();
+        bool surface     = m_builder.has(mitsuba::EmitterFlags::Surface);
+        bool directional = m_builder.has(mitsuba::EmitterFlags::DeltaDirection);
         if (emitter->sampling_weight() == 0)
             m_others.add_unsampled(emitter);
         else if (surface && directional) // Mitsuba never connects to it
@@ -68,9 +65,21 @@ private:
             add_area(emitter, emitter->shape());
         else if (directional || m_builder.has(mitsuba::EmitterFlags::Infinite))
             m_others.add_infinite(emitter);
-        else if (!(name == "PointLight" && m_points.add_point(emitter)) &&
-                 !(name == "SpotLight" && m_points.add_spot(emitter)))
+        else if (auto light = read_point(emitter))
+            m_builder.add_light(*light);
+        else
             m_others.add(emitter);
+    }
+
+    /// An emitter without a shape; none if no row can hold it
+    std::optional<HostLight> read_point(const Emitter *emitter) const {
+        std::string_view name = emitter->class_name();
+        if (name == "PointLight")
+            return PointLight::read(emitter);
+        if (name == "SpotLight")
+            return SpotLight::read(
+                emitter, m_builder.has(mitsuba::EmitterFlags::SpatiallyVarying));
+        return {};
     }
 
     /// An emitter on a shape, by the class of the shape
@@ -82,17 +91,31 @@ private:
             m_meshes.add(emitter, (const Mesh *) shape, e);
         } else {
             uint32_t light = m_builder.row_count();
-            if (!known || !m_quadrics.add(emitter, shape, e))
+            if (!known || !add_quadric(emitter, shape, e))
                 m_others.add(emitter);
             m_builder.push_primitive(light);
         }
         m_builder.push_shape(shape, first);
     }
 
+    /// False if the shape is no sphere, disk or cylinder
+    bool add_quadric(const Emitter *emitter, const Shape *shape, const Emission &e) {
+        std::string_view name = shape->class_name();
+        if (name == "Sphere")
+            m_builder.add_light(SphereLight::read(emitter, shape, e, m_images));
+        else if (name == "Disk")
+            m_builder.add_light(DiskLight::read(emitter, shape, e, m_images));
+        else if (name != "Cylinder")
+            return false;
+        else if (auto light = CylinderLight::read(emitter, shape, e, m_images))
+            m_builder.add_light(*light);
+        else
+            m_builder.add_only_hit();
+        return true;
+    }
+
     TableBuilder<Float, Spectrum> m_builder;
     ShownImages<Float, Spectrum> m_images;
-    PointLights<Float, Spectrum> m_points{ m_builder };
-    Quadrics<Float, Spectrum> m_quadrics{ m_builder, m_images };
     MeshLights<Float, Spectrum> m_meshes{ m_builder, m_images };
     OtherLights<Float, Spectrum> m_others{ m_builder };
 };

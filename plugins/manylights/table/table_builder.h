@@ -2,15 +2,13 @@
 
 /**
  * The light table while it grows, emitter by emitter, and its bookkeeping: rows, bounds and
- * primitives, and what the scene has. Readers of emitters (point_lights.h, quadrics.h,
- * mesh_lights.h, other_lights.h) are handed it; it knows none of them.
+ * primitives, and what the scene has. It is handed what was read of
+ * each light.
  */
 
-#include "emission_reader.h"
 #include "host_table.h"
-#include "light_bounds.h"
+#include "light_flux.h"
 #include "triangle_chunks.h"
-#include <cstring>
 #include <mitsuba/core/logger.h>
 #include <mitsuba/render/mesh.h>
 #include <mitsuba/render/scene.h>
@@ -19,17 +17,9 @@ namespace manylights {
 
 namespace dr = drjit;
 
-/// Spots up to this angle are narrow: wider ones resemble a cosine
-constexpr float kWidestBeam = .5f;
 /// Narrow spots matter if they have this share of the tree's flux: where they have less, their
 /// noise is small, and lobes in place of harmonics slow all lights down
 constexpr double kLeastBeams = .01;
-
-/// For lights that their emitter evaluates: which primitive, and are its edges swapped?
-inline void set_primitive(LightRow &row, uint32_t index, bool swapped) {
-    std::memcpy(&row.color[0], &index, sizeof(float));
-    row.color[1] = swapped ? 1.f : 0.f;
-}
 
 template <typename Float, typename Spectrum> class TableBuilder {
 public:
@@ -81,15 +71,6 @@ public:
 
     // ------------------------------------------------------------------------ Lights
 
-    LightRow make_row(LightKind kind, const Emission &e) const {
-        LightRow row{};
-        std::copy_n(e.color, 3, row.color);
-        row.brightness = e.brightness;
-        row.scale      = e.scale;
-        row.tag        = make_tag(kind, e.tabulated, m_emitter);
-        return row;
-    }
-
     /// Brightness of a light of the current emitter whose power cannot be found: it will get
     /// the mean of the others
     float unknown_brightness() {
@@ -98,7 +79,9 @@ public:
     }
 
     /// Lights without power, and degenerate ones, stay out
-    void add_light(const LightRow &row, const LightBounds &bounds) {
+    void add_light(const HostLight &light) {
+        auto [row, bounds] = light;
+        row.tag |= m_emitter << kTagEmitterShift;
         ++m_table.light_count;
         LightKind kind = kind_of(row);
         bool hit_able  = has(mitsuba::EmitterFlags::Surface);
@@ -113,9 +96,8 @@ public:
                 note_only_hit();
             return;
         }
-        m_table.proportional[m_emitter] =
-            kind != LightKind::Other && (row.tag & kTagTabulated);
-        bool beam   = kind == LightKind::Spot && row.geometry[6] < kWidestBeam,
+        m_table.proportional[m_emitter] = row.tag & kTagTabulated;
+        bool beam   = kind == LightKind::Spot && SpotLight::is_narrow(row),
              known  = row.brightness != kUnknownPower;
         double flux = known ? light_flux(row, /* beams = */ false) : 0;
         (beam ? m_beam_flux : m_other_flux) += flux;
@@ -128,8 +110,12 @@ public:
     /// Add `count` triangles and their primitives, each read by `read(index, row, bounds)`, on
     /// all threads
     template <typename F> void add_triangles(size_t count, const F &read) {
-        size_t first                      = m_table.rows.size();
-        std::vector<TriangleChunk> chunks = append_triangles(m_table, count, read);
+        size_t first     = m_table.rows.size();
+        auto read_tagged = [&](size_t i, LightRow &row, LightBounds &bounds) {
+            read(i, row, bounds);
+            row.tag |= m_emitter << kTagEmitterShift;
+        };
+        std::vector<TriangleChunk> chunks = append_triangles(m_table, count, read_tagged);
         bool complete                     = m_table.rows.size() == first + count,
              any                          = m_table.rows.size() > first;
         m_table.light_count += (uint32_t) count;

@@ -6,7 +6,7 @@
  */
 
 #include "host_table.h"
-#include "light_bounds.h"
+#include "light_flux.h"
 
 namespace manylights {
 

@@ -21,7 +21,7 @@
  */
 
 #include "manylights/base/host_memory.h"
-#include "manylights/table/light_row.h"
+#include "manylights/kinds/light_row.h"
 #include <functional>
 
 namespace manylights {

@@ -12,7 +12,7 @@
 
 #include "cluster_importance.h"
 #include "manylights/learning/visibility.h"
-#include "manylights/table/row.h"
+#include "manylights/kinds/row.h"
 #include "tree_builder.h"
 #include <array>
 #include <drjit/dynamic.h>

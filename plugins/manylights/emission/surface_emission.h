@@ -5,6 +5,7 @@
  */
 
 #include "emission_reader.h"
+#include "surface_hit.h"
 #include <array>
 #include <mitsuba/render/emitter.h>
 #include <mitsuba/render/shape.h>
@@ -109,16 +110,11 @@ public:
 private:
     Color3f color(const dr::uint32_array_t<Float> &primitive, const Point2f &uv,
                   const Point3f &p) const {
-        PreliminaryIntersection3f pi = dr::zeros<PreliminaryIntersection3f>();
-        pi.valid                     = true;
-        pi.t                         = 0.f; // zeros() has infinity
-        pi.prim_uv                   = uv;
-        pi.prim_index                = primitive;
-        pi.shape                     = m_shape;
-        Ray3f ray                    = dr::zeros<Ray3f>();
-        ray.o                        = p;
-        ray.d                        = { 0.f, 0.f, 1.f };
-        SurfaceInteraction3f si      = m_shape->compute_surface_interaction(
+        auto pi   = surface_hit<Float, Shape>(m_shape, primitive, uv, Float(0.f), true);
+        Ray3f ray = dr::zeros<Ray3f>();
+        ray.o     = p;
+        ray.d     = { 0.f, 0.f, 1.f };
+        SurfaceInteraction3f si = m_shape->compute_surface_interaction(
             ray, pi, +mitsuba::RayFlags::All, 0, true);
         si.shape      = m_shape;
         si.prim_index = primitive;

@@ -7,7 +7,7 @@
  * mesh, a sphere, a disk, a cylinder, or any other emitter of finite extent as a
  * whole. Rows are filled once for each scene (light_table.h), put into the order of
  * the tree's leaves (tree_builder.h) and read by the kernels as 16 consecutive floats
- * (light_points.h), without a virtual call.
+ * (row.h), without a virtual call.
  *
  * Plain C++, no Dr.Jit and no Mitsuba types: compiled once for all variants.
  */
@@ -18,28 +18,9 @@
 
 namespace manylights {
 
-/// How the geometry of a row is to be read
+/// How the geometry of a row is to be read; each kind is a file beside this one (kinds.h).
+/// Their order has no meaning.
 enum class LightKind : uint32_t { Point, Spot, Triangle, Sphere, Disk, Cylinder, Other };
-
-/// Number of entries of \ref LightKind; `Other` stays the last one
-constexpr uint32_t kLightKinds = (uint32_t) LightKind::Other + 1;
-
-/// Is such a light a point, which no ray hits? No `default` here and in all other switches: the
-/// compiler then names a kind that was forgotten
-constexpr bool is_delta(LightKind kind) {
-    switch (kind) {
-        case LightKind::Point:
-        case LightKind::Spot:
-            return true;
-        case LightKind::Triangle:
-        case LightKind::Sphere:
-        case LightKind::Disk:
-        case LightKind::Cylinder:
-        case LightKind::Other:
-            break;
-    }
-    return false;
-}
 
 /// Marks "no light", "no node" and "not a primitive of a light"
 constexpr uint32_t kNone = 0xffffffffu;
@@ -47,26 +28,14 @@ constexpr uint32_t kNone = 0xffffffffu;
 constexpr uint32_t kOnlyHit = 0xfffffffeu;
 
 /**
- * One row of the table.
- *
- * kind     | geometry
- * ---------|---------------------------------------------------------------------
- * Point    | position[3]
- * Spot     | position[3], axis[3], cutoff angle (rad), 1 / (cutoff - beam width)
- * Triangle | vertex[3], edge1[3], edge2[3]; emits to the side of edge1 x edge2
- * Sphere   | centre[3], radius, +1 (emits outwards) or -1 (inwards)
- * Disk     | centre[3], u[3], v[3]: the unit disk under (u, v); emits along u x v
- * Cylinder | base[3], axis[3] (of the cylinder's length), radius, +1 or -1
- * Other    | mean position[3], variance of the position
+ * One row of the table; what its geometry means is said by its kind.
  *
  * Radiance (areas) or intensity (points and spots) is `color` in RGB and monochrome
  * variants; in spectral ones it is scale * D65(lambda) * S(color, lambda), with S
  * Mitsuba's sigmoid upsampling of the coefficients `color`. A row that is not
  * `tabulated` has its emission evaluated by its emitter; `color[0]` then holds the bits
  * of the triangle's index (0 for other shapes) and `color[1]` is 1 if its two edges, or the
- * axes of a disk, were swapped to make it emit to the right side, 0 if not. A triangle with
- * smooth normals is sampled on both sides (kTagTwoSided), since the side on which it emits
- * changes from point to point.
+ * axes of a disk, were swapped to make it emit to the right side, 0 if not.
  */
 struct LightRow {
     float geometry[9];
@@ -75,7 +44,7 @@ struct LightRow {
     float brightness;
     /// See above; 1 in RGB and monochrome variants
     float scale;
-    /// kind, flag and emitter index: see \ref make_tag
+    /// Kind, flags and the index into the scene's emitters, see kTagKindMask
     uint32_t tag;
     /// 4 * parent node + slot of this light in the parent (tree_builder.h)
     uint32_t link;
@@ -97,16 +66,8 @@ constexpr uint32_t kTagKindMask     = 7;
 constexpr uint32_t kTagTabulated    = 8;
 constexpr uint32_t kTagTwoSided     = 16;
 constexpr uint32_t kTagEmitterShift = 5;
-static_assert(kLightKinds <= kTagKindMask + 1, "the tag has too few bits for all kinds");
-
-/// Spot of a hard edge: 1 / (cutoff - beam width), which would be infinite
-constexpr float kHardEdge = 1e10f;
-
-/// Pack kind, "radiance is in the table" and the index into the scene's emitters
-constexpr uint32_t make_tag(LightKind kind, bool tabulated, uint32_t emitter) {
-    return (uint32_t) kind | (tabulated ? kTagTabulated : 0) |
-           (emitter << kTagEmitterShift);
-}
+/// How many kinds the tag has room for
+constexpr uint32_t kMostKinds = kTagKindMask + 1;
 
 inline LightKind kind_of(const LightRow &row) {
     return (LightKind) (row.tag & kTagKindMask);

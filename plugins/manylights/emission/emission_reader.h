@@ -5,7 +5,7 @@
  * numbers in RGB and monochrome variants, D65 times an upsampled colour in spectral ones.
  */
 
-#include "light_row.h"
+#include "emission.h"
 #include "manylights/base/device_scalars.h"
 #include "manylights/base/host_view.h"
 #include "manylights/base/loop.h"
@@ -60,16 +60,6 @@ template <typename Float> float read_scalar(const Float &value) {
     read_scalars<Float, 1>({ &value }, result);
     return result[0];
 }
-
-/// Emission of an emitter, or of a part of it
-struct Emission {
-    float color[3] = {};
-    float scale = 1.f, brightness = 0.f;
-    /// Is it the same everywhere on the emitter? If not, nothing of this is valid
-    bool constant = false;
-    /// Can a row hold it? If not, only `brightness` is valid
-    bool tabulated = false;
-};
 
 /// Names of the textures that make emitters shine
 constexpr std::string_view kEmissionNames[] = { "intensity", "radiance", "irradiance" };
