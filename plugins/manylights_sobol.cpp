@@ -38,32 +38,36 @@ sequence: the first 16 of 64 samples are the same as those of a rendering with 1
 it ends, and best after 1, 2, 4, 8, 16... samples. Each sample is computed from its number, without
 tables and without a state: scalar, LLVM and CUDA variants have the same sequences.
 
-Each request of an integrator, for a number or for a pair, has its own Sobol' sequence in one or
-two dimensions, shuffled and Owen-scrambled with a hash of seed, pixel and number of the request
-(Burley 2020). Every aligned block of :math:`2^k` samples has one of them in each of :math:`2^k`
-intervals of the same size, and pairs have one in each elementary interval, whatever its shape.
+Four random numbers of a sample belong to one digital sequence, the next four to another one: the
+position on the film and two numbers of the integrator, for instance. Each sequence is shuffled
+and Owen-scrambled with a hash of seed, pixel and its number (Burley 2020). Every aligned block of
+:math:`2^k` samples has one number in each of :math:`2^k` intervals, and pairs that are asked for at
+once have one in each elementary interval, whatever its shape, as those of Sobol'. With
+:math:`4^k` samples the same holds in base 4 for all four numbers (a (0, 4)-sequence after Faure and
+Niederreiter): any two of them are spread over their square, any three over their cube.
 
-It works well where the radiance of a pixel is smooth, or has few jumps, in each pair of random
-numbers: soft shadows, glossy reflections, antialiasing, depth of field, the first bounces of paths.
-It then needs fewer samples than :monosp:`independent` for the same error, and about as many as
-:monosp:`multijitter`, or fewer; it is as fast as the first and faster than the second.
+It works well where the radiance of a pixel is smooth, or has few jumps, in few random numbers: soft
+shadows, glossy reflections, antialiasing, depth of field, the first bounces of paths. It then needs
+fewer samples than :monosp:`independent` for the same error, and fewer than :monosp:`multijitter`,
+with numbers of samples that none of them has to round.
 
 It gains little
 
 - after many bounces of long paths, and where other requests come in between for some samples only,
-  such as those of media with varying density: what one request leaves over of the variance, the
-  stratification of others does not remove;
+  such as those of media with varying density: what depends on numbers of different sequences is
+  as noisy as with independent ones, in small parts up to twice as noisy;
 - where an integrator chooses one of many emitters with a number that it then uses for a point on
   it, as Mitsuba's :monosp:`direct` and :monosp:`path` do: each light gets few of the points;
 - in blocks of samples that are not aligned: samples 3 to 10 are less even than 0 to 7 or 8 to 15.
 
-Numbers of different requests are not stratified together, where :monosp:`orthogonal` may have less
-error, with sample counts that are squares of primes. Pixels are independent of each other: the
-noise is white.
+The :monosp:`orthogonal` sampler spreads all pairs of numbers, not only those within four, and may
+have less error, with sample counts that are squares of primes. Pixels are independent of each
+other: their noise is white.
 
-Sources: Art Owen, *Randomly permuted (t, m, s)-nets and (t, s)-sequences*, 1995; Samuli Laine and
-Tero Karras, *Stratified sampling for stochastic transparency*, 2011; Brent Burley, *Practical
-hash-based Owen scrambling*, JCGT 9(4), 2020.
+Sources: Art Owen, *Randomly permuted (t, m, s)-nets and (t, s)-sequences*, 1995; Harald
+Niederreiter, *Low-discrepancy and low-dispersion sequences*, 1988; Samuli Laine and Tero Karras,
+*Stratified sampling for stochastic transparency*, 2011; Brent Burley, *Practical hash-based Owen
+scrambling*, JCGT 9(4), 2020.
 
 .. tabs::
     .. code-tab::  xml
@@ -116,12 +120,15 @@ public:
 
     Float next_1d(Mask = true) override {
         Assert(seeded());
-        return fraction(next_sequence().number(sample_index()));
+        return fraction(sample(m_dimension_index++).number());
     }
 
     Point2f next_2d(Mask = true) override {
         Assert(seeded());
-        auto [x, y] = next_sequence().pair(sample_index());
+        // An even one, so that both belong together
+        UInt32 dimension  = (m_dimension_index + 1u) & ~1u;
+        m_dimension_index = dimension + 2u;
+        auto [x, y]       = sample(dimension).pair();
         return { fraction(x), fraction(y) };
     }
 
@@ -143,8 +150,6 @@ public:
     MI_DECLARE_CLASS(SobolSampler)
 
 private:
-    using Sequence = manylights::SobolSequence<UInt32>;
-
     SobolSampler(const SobolSampler &) = default;
 
     /// Returns the keys of the lanes, and numbers the samples of each
@@ -169,13 +174,9 @@ private:
         return sample_tea_32(seed, pixel).first;
     }
 
-    UInt32 sample_index() const {
-        return m_first_sample + m_number + m_sample_index * m_stride;
-    }
-
-    Sequence next_sequence() {
-        UInt32 request = m_dimension_index++;
-        return Sequence(manylights::mix_bits<UInt32>(m_key + request * 0x9e3779b9u));
+    manylights::SobolSample<UInt32> sample(const UInt32 &dimension) const {
+        return { m_key, m_first_sample + m_number + m_sample_index * m_stride,
+                 dimension };
     }
 
     /// In [0, 1): the digits that fit
@@ -193,7 +194,7 @@ private:
     UInt32 m_key = 0;
 
 public:
-    /// Loops change nothing but the number of the request
+    /// Loops change nothing but the dimension
     void traverse_1_cb_ro(void *payload,
                           drjit::detail::traverse_callback_ro fn) const override {
         if (!jit_flag(JitFlag::EnableObjectTraversal))

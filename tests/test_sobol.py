@@ -159,11 +159,29 @@ def test_aligned_blocks_of_pairs_are_nets(llvm, size):
         assert is_net(x, y)
 
 
+def cells_of(numbers, shape):
+    """Return how many points are in each of the boxes that the unit cube is cut into."""
+    points = np.stack(numbers, axis=-1)
+    counts, _ = np.histogramdd(points, bins=shape, range=[(0, 1)] * len(shape))
+    return counts
+
+
+@pytest.mark.parametrize("requests", ["1111", "22", "211"])
+def test_four_numbers_are_a_net_in_base_four(llvm, requests):
+    shapes = [
+        shape for shape in itertools.product((1, 4, 16, 64), repeat=4) if np.prod(shape) == 64
+    ]
+    for sample in np.swapaxes(draw(8, 64, requests, first=64), 0, 1):
+        assert all((cells_of(sample, shape) == 1).all() for shape in shapes)
+
+
 def test_numbers_that_are_no_net_are_found():
     rng = np.random.default_rng(1)
     assert not is_net(*rng.random((2, 16)))
     grid = (np.arange(16) + 0.5) / 16
     assert not is_net(grid, grid)
+    assert (cells_of([grid, grid], (16, 1)) == 1).all()
+    assert not (cells_of([grid, grid], (4, 4)) == 1).all()
 
 
 def star_discrepancy(x, y):

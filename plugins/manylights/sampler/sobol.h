@@ -1,12 +1,16 @@
 #pragma once
 
 /**
- * Samples of shuffled and scrambled Sobol' sequences, by index and without tables.
+ * Samples of shuffled and scrambled digital sequences, by index and without tables.
  *
- * Brent Burley, Practical Hash-based Owen Scrambling, JCGT 9(4), 2020. Each request for a
- * number or a pair has a sequence of its own ("padding"), which is shuffled and scrambled by
- * hashes: both are Owen scramblings, one of the index and one of the value, so that all
- * aligned blocks of 2^k samples are (0, k, 2)-nets, and so are those that begin with sample 0.
+ * Brent Burley, Practical Hash-based Owen Scrambling, JCGT 9(4), 2020: four dimensions belong to
+ * one sequence, the next four to another one ("padding"), which is shuffled and scrambled by
+ * hashes. Both are Owen scramblings, one of the index and one of the value, so that aligned
+ * blocks of 2^k samples stay as even as they are.
+ *
+ * The four dimensions are not those of Sobol' but those of Faure and Niederreiter over the field
+ * GF(4): with 4^k samples each elementary interval of base 4, in all four of them, has one. The
+ * first pair of dimensions is that of Sobol', the second is alike: (0, 2)-sequences in base 2.
  *
  * Values are binary fractions of 32 digits.
  */
@@ -51,42 +55,70 @@ template <typename UInt32> UInt32 scramble_reversed(UInt32 x, const UInt32 &seed
     return x ^ (x * 0x53a22864u);
 }
 
-/// The second dimension's value, digits reversed: the first one's is the index, and digits are
-/// multiplied by Pascal's triangle modulo 2, which is a product of five matrices
-template <typename UInt32> UInt32 second_dimension(UInt32 index) {
-    index ^= index >> 16;
-    index ^= (index >> 8) & 0x00ff00ffu;
-    index ^= (index >> 4) & 0x0f0f0f0fu;
-    index ^= (index >> 2) & 0x33333333u;
-    return index ^ ((index >> 1) & 0x55555555u);
+/// Every digit of two bits with number i, times the i-th power of the field's generator w (its
+/// polynomial is x^2 + x + 1), whose third power is 1: times w where `once`, w^2 where `twice`
+template <typename UInt32>
+UInt32 scale_digits(const UInt32 &x, const UInt32 &once, const UInt32 &twice) {
+    UInt32 high = (x >> 1) & 0x55555555u, low = x & 0x55555555u, sum = high ^ low;
+    // w x + x = w^2 x, and w^2 x + x = w x
+    return x ^ (((low << 1) | sum) & once) ^ (((sum << 1) | high) & twice);
 }
 
-/// One of many sequences of pairs, or of numbers, which are the pairs' first ones
-template <typename UInt32> class SobolSequence {
+/// Digits of two bits times Pascal's triangle modulo 2, which is a product of four matrices
+template <typename UInt32> UInt32 multiply_pascal(UInt32 x) {
+    x ^= x >> 16;
+    x ^= (x >> 8) & 0x00ff00ffu;
+    x ^= (x >> 4) & 0x0f0f0f0fu;
+    return x ^ ((x >> 2) & 0x33333333u);
+}
+
+/**
+ * The value of a dimension, 0 to 3, at an index; digits reversed. Dimension 0 reverses the
+ * digits of the index, dimension k has the matrix D^-1 P D with Pascal's P and the powers of
+ * w^(k - 1) in D. The last line changes digits of base 4 within themselves: it makes the
+ * dimensions 0 and 1, and 2 and 3, (0, 2)-sequences in base 2.
+ */
+template <typename UInt32>
+UInt32 digital_value(const UInt32 &index, const UInt32 &dimension) {
+    // Digits 1, 4, 7... and 2, 5, 8...
+    UInt32 ones  = dr::select(dimension >= 2u, UInt32(0x0c30c30cu), UInt32(0u)),
+           twos  = dr::select(dimension >= 2u, UInt32(0x30c30c30u), UInt32(0u)),
+           once  = dr::select(dimension == 2u, ones, twos),
+           twice = dr::select(dimension == 2u, twos, ones);
+    UInt32 x     = multiply_pascal(scale_digits(index, once, twice));
+    x            = scale_digits(x, twice, once);
+    x ^= (x >> 1) & dr::select(dimension <= 2u, UInt32(0x55555555u), UInt32(0u));
+    return dr::select(dimension == 0u, index, x);
+}
+
+/// Numbers and pairs of one sample: a function of a key of 32 random bits, the sample's index and
+/// the dimension
+template <typename UInt32> class SobolSample {
 public:
-    /// `key` is any number of 32 random bits
-    explicit SobolSequence(const UInt32 &key) : m_key(key) {}
+    static constexpr uint32_t kTogether = 4;
 
-    UInt32 number(const UInt32 &index) const { return first(shuffle(index)); }
+    SobolSample(const UInt32 &key, const UInt32 &index, const UInt32 &dimension)
+        : m_seed(mix_bits<UInt32>(key + dimension * 0x9e3779b9u)),
+          m_dimension(dimension % kTogether) {
+        UInt32 group =
+            mix_bits<UInt32>((key ^ 0xc2b2ae35u) + (dimension / kTogether) * 0x85ebca6bu);
+        m_index = reverse_bits(scramble_reversed(reverse_bits(index), group));
+    }
 
-    std::pair<UInt32, UInt32> pair(const UInt32 &index) const {
-        UInt32 shuffled = shuffle(index);
-        return { first(shuffled),
-                 reverse_bits(scramble_reversed(second_dimension(shuffled),
-                                                mix_bits(m_key ^ 0xc2b2ae35u))) };
+    UInt32 number() const { return value(m_dimension, m_seed); }
+
+    /// Dimensions 0 and 1, or 2 and 3
+    std::pair<UInt32, UInt32> pair() const {
+        return { number(),
+                 value(m_dimension + 1u, mix_bits<UInt32>(m_seed ^ 0x5bd1e995u)) };
     }
 
 private:
-    UInt32 shuffle(const UInt32 &index) const {
-        return reverse_bits(scramble_reversed(reverse_bits(index), m_key));
+    UInt32 value(const UInt32 &dimension, const UInt32 &seed) const {
+        return reverse_bits(scramble_reversed(digital_value(m_index, dimension), seed));
     }
 
-    /// An index is the first dimension's value with its digits reversed
-    UInt32 first(const UInt32 &shuffled) const {
-        return reverse_bits(scramble_reversed(shuffled, mix_bits(m_key ^ 0x85ebca6bu)));
-    }
-
-    UInt32 m_key;
+    UInt32 m_seed, m_dimension, m_index;
 };
 
 } // namespace manylights
