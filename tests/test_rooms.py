@@ -83,7 +83,18 @@ def test_no_two_classes_have_one_name():
 PLUGINS = PACKAGE.parents[1] / "plugins" / "manylights"
 
 #: Folders of the C++, in the order of the data: each includes only those before it, and itself.
-FOLDERS = ("base", "emission", "kinds", "table", "receiver", "learning", "tree", "choice", "scene")
+FOLDERS = (
+    "base",
+    "sampler",
+    "emission",
+    "kinds",
+    "table",
+    "receiver",
+    "learning",
+    "tree",
+    "choice",
+    "scene",
+)
 FOLDERS += ("direct", "paths", "render", "plugin")
 
 INCLUDE = re.compile(r'#include ["<]manylights/(\w+)/')
