@@ -9,8 +9,8 @@
  * does not run once for every tentative collision.
  */
 
+#include "collisions.h"
 #include "manylights/base/loop.h"
-#include "media_kinds.h"
 #include <drjit/random.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/medium.h>
@@ -22,9 +22,11 @@ namespace manylights {
 template <typename Float, typename Spectrum> class Media {
 public:
     MI_IMPORT_TYPES(Scene, Sampler, BSDFPtr, MediumPtr)
-    using Rng = dr::PCG32<dr::uint32_array_t<dr::detached_t<Float>>>;
+    using Collision = manylights::Collision<Float, Spectrum>;
+    using Rng       = dr::PCG32<dr::uint32_array_t<dr::detached_t<Float>>>;
 
-    Media(const Scene *scene, const MediaKinds &kinds) : m_scene(scene), m_kinds(kinds) {}
+    Media(const Scene *scene, const MediaKinds &kinds)
+        : m_scene(scene), m_kinds(kinds), m_collisions(kinds) {}
 
     const MediaKinds &kinds() const { return m_kinds; }
 
@@ -35,7 +37,7 @@ public:
         Mask scattered;
         /// Transmittance times scattering coefficient (if it scattered), over the density
         UnpolarizedSpectrum weight;
-        /// \ref collide
+        /// \ref Collisions::next
         UnpolarizedSpectrum densities;
         DRJIT_STRUCT(Flight, mei, scattered, weight, densities)
     };
@@ -56,8 +58,8 @@ public:
         state.flight.weight    = UnpolarizedSpectrum(1.f);
         state.flight.densities = densities;
         auto step              = [&](State &s) {
-            Collision c = collide(medium, s.ray, s.distance, s.flight.densities,
-                                  s.sampler->next_1d(s.active), s.active);
+            Collision c = m_collisions.next(medium, s.ray, s.distance, s.flight.densities,
+                                            s.sampler->next_1d(s.active), s.active);
             Float null_probability = dr::mean(c.densities * c.null_fraction);
             Mask null = c.hit && m_kinds.heterogeneous &&
                         (m_kinds.heterogeneous ? s.sampler->next_1d(s.active)
@@ -168,96 +170,6 @@ public:
     }
 
 private:
-    /// A tentative collision, or a free flight to the end of the distance
-    struct Collision {
-        MediumInteraction3f mei;
-        Mask hit;
-        /// Transmittance over the density of the distance
-        UnpolarizedSpectrum weight;
-        UnpolarizedSpectrum null_fraction;
-        UnpolarizedSpectrum densities;
-    };
-
-    /**
-     * One step of tracking. Where the extinction varies between wavelengths or channels, a
-     * random one is followed, its majorant and its chance of a null collision. The density of
-     * a path is the mean of those that each of them would have given *all* of it (spectral
-     * MIS), so that no weight exceeds their number, however many collisions there are.
-     *
-     * @param densities  of the path so far, for each channel, over their mean: the chances of
-     *                   channels to be followed. They are not differentiated, nor is the
-     *                   distance; what is evaluated there is.
-     */
-    Collision collide(const MediumPtr &medium, Ray3f ray, const Float &distance,
-                      const UnpolarizedSpectrum &densities, Float u, Mask active) const {
-        UInt32 channel(0);
-        if (m_kinds.chromatic_majorants)
-            std::tie(channel, u) = choose_channel(densities, u);
-        ray.maxt = distance;
-        Collision c{ medium->sample_interaction(ray, u, channel, active), false, 0.f, 0.f,
-                     densities };
-        Float end = distance;
-        if (m_kinds.heterogeneous) {
-            // The medium may end before the surface does, or be missed
-            auto [met, near, far] = medium->intersect_aabb(ray);
-            met &= dr::isfinite(near) || dr::isfinite(far);
-            end = dr::select(met, dr::minimum(distance, far), c.mei.mint);
-        }
-        if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            if (m_kinds.chromatic_majorants)
-                follow_channel(c.mei, medium, ray, end, u, channel, active);
-        c.mei.t = dr::detach(c.mei.t);
-        c.mei.p = dr::detach(c.mei.p);
-        c.hit   = active && c.mei.is_valid() && c.mei.t <= end;
-
-        UnpolarizedSpectrum majorant = c.mei.combined_extinction;
-        // Finite, so that no extinction over no end leaves 1
-        Float length =
-            dr::clip(dr::minimum(c.mei.t, end) - c.mei.mint, 0.f, dr::Largest<Float>);
-        UnpolarizedSpectrum tr = dr::exp(-length * majorant);
-        c.densities   = dr::detach(densities * dr::select(c.hit, tr * majorant, tr));
-        Float density = dr::mean(c.densities);
-        Mask possible = density > 0.f;
-        c.weight      = dr::select(possible, tr / density, 0.f);
-        c.densities   = dr::select(possible, c.densities / density, 1.f);
-        // Extinctions may exceed a grid's majorant by rounding
-        c.null_fraction = dr::detach(dr::clip(
-            dr::select(majorant > 0.f, c.mei.sigma_n / majorant, 0.f), 0.f, 1.f));
-        return c;
-    }
-
-    /// A channel, chosen by its density, and the number u used again
-    static std::pair<UInt32, Float> choose_channel(const UnpolarizedSpectrum &densities,
-                                                   const Float &u) {
-        Float target = u * dr::sum(densities), below(0.f), begin(0.f), share(1.f);
-        UInt32 channel(0);
-        for (uint32_t i = 0; i < dr::size_v<UnpolarizedSpectrum>; ++i) {
-            Float density                = densities.entry(i);
-            Mask reached                 = target >= below && density > 0.f;
-            dr::masked(channel, reached) = i;
-            dr::masked(begin, reached)   = below;
-            dr::masked(share, reached)   = density;
-            below += density;
-        }
-        return { channel,
-                 dr::clip((target - begin) / share, 0.f, dr::OneMinusEpsilon<Float>) };
-    }
-
-    /// A collision at the distance that a wavelength chooses: Mitsuba takes the first one
-    void follow_channel(MediumInteraction3f &mei, const MediumPtr &medium,
-                        const Ray3f &ray, const Float &end, const Float &u,
-                        const UInt32 &channel, Mask active) const {
-        Float sigma = mei.combined_extinction.entry(0);
-        for (uint32_t i = 1; i < dr::size_v<UnpolarizedSpectrum>; ++i)
-            sigma = dr::select(channel == i, mei.combined_extinction.entry(i), sigma);
-        Float t = mei.mint - dr::log(1.f - u) / sigma;
-        active &= t <= end;
-        mei.t = dr::select(active, t, dr::Infinity<Float>);
-        mei.p = ray(t);
-        std::tie(mei.sigma_s, mei.sigma_n, mei.sigma_t) =
-            medium->get_scattering_coefficients(mei, active);
-    }
-
     /// Transmittance of a piece of a ray, closed form or ratio tracking
     UnpolarizedSpectrum within_medium(const MediumPtr &medium, const Ray3f &ray,
                                       const Float &distance, Rng &rng,
@@ -302,9 +214,9 @@ private:
         loop(
             state, [](const State &s) { return s.active; },
             [&](State &s) {
-                Float u = s.rng.template next_float<dr::detached_t<Float>>();
-                Collision c =
-                    collide(medium, s.ray, s.distance, s.densities, u, s.active);
+                Float u     = s.rng.template next_float<dr::detached_t<Float>>();
+                Collision c = m_collisions.next(medium, s.ray, s.distance, s.densities, u,
+                                                s.active);
                 dr::masked(s.result, s.active) =
                     s.result * c.weight * dr::select(c.hit, c.mei.sigma_n, 1.f);
                 if (m_kinds.chromatic)
@@ -354,6 +266,7 @@ private:
 
     const Scene *m_scene;
     MediaKinds m_kinds;
+    Collisions<Float, Spectrum> m_collisions;
 };
 
 } // namespace manylights
