@@ -17,7 +17,10 @@
  * so that they cannot disagree.
  */
 
-#include "manylights/choice/parameters.h"
+#include "manylights/base/slots.h"
+#include "manylights/choice/all_lights.h"
+#include "manylights/choice/splitting.h"
+#include "manylights/choice/systematic.h"
 #include "vertex.h"
 #include <algorithm>
 
@@ -57,7 +60,7 @@ template <typename FloatD> struct AllLightsSource {
     FloatD inclusion_probability(const TreeView<FloatD> &, const Receiver<FloatD> &,
                                  const UInt32D &, const FloatD &, const MaskD &,
                                  const MaskD &) const {
-        return FloatD(1.f);
+        return AllLights<FloatD>::inclusion_probability();
     }
 };
 
@@ -73,8 +76,8 @@ template <typename FloatD> struct SystematicSource {
     FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
                                  const UInt32D &light, const FloatD &, const MaskD &first,
                                  const MaskD &active) const {
-        return dr::minimum(1.f, effort_of<FloatD>(params, first).candidates *
-                                    leaf_probability(tree, at, light, active));
+        return SystematicCursor<FloatD>::inclusion_probability(
+            tree, at, light, effort_of<FloatD>(params, first).candidates, active);
     }
 };
 
@@ -162,9 +165,10 @@ struct Strategy {
                 return f(SystematicSource<FloatD>{ params });
             case Source::Splitting:
                 return f(SplittingSource<FloatD>{ params });
-            default:
-                return f(AllLightsSource<FloatD>{ params });
+            case Source::AllLights:
+                break;
         }
+        return f(AllLightsSource<FloatD>{ params });
     }
 };
 
