@@ -9,7 +9,7 @@
  *     any, N <= m                     AllLights               KeepAll
  *     resampled_tree, K <= m; tree    Systematic              KeepAll
  *     resampled_tree, K > m           Systematic              Resample
- *     exhaustive, N > m               AllLights               Resample (s = m: TraceAll)
+ *     exhaustive, N > m               AllLights               Resample
  *     talk                            Splitting               Resample
  *     adaptive_splitting              Splitting               TraceAll
  *
@@ -147,7 +147,7 @@ struct Strategy {
         infinite_probability = few ? 1.f : 1.f / infinite_lights;
     }
 
-    /// With enough shadow rays for all lights nothing has to be chosen. Kernels are the same
+    /// With slots and shadow rays for all lights nothing has to be chosen. Kernels are the same
     /// for all vertices, scalar variants look at each.
     template <typename FloatD> Fate fate_at(const Effort<FloatD> &effort) const {
         bool enough;
@@ -155,7 +155,8 @@ struct Strategy {
             enough = !chooses;
         else
             enough = items <= effort.shadow_rays;
-        return source == Source::AllLights && enough ? Fate::TraceAll : fate;
+        bool all_kept = source == Source::AllLights && fate == Fate::KeepAll;
+        return all_kept && enough ? Fate::TraceAll : fate;
     }
 
     /// Call f with the source of candidates
