@@ -32,8 +32,8 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
  * - bsdf_samples
    - |int|
    - Rays sampled from the BSDF at each shading point, combined with the above by multiple
-     importance sampling. 0 leaves light sampling alone, which is enough without large
-     emitters and mirrors. (Default: 1)
+     importance sampling, 0 to 1024. 0 leaves light sampling alone, which is enough without
+     large emitters and mirrors. (Default: 1)
 
  * - hide_emitters
    - |bool|
@@ -228,7 +228,6 @@ public:
         std::ostringstream oss;
         oss << "ManyLightsDirect[" << std::endl
             << "  " << string::indent(manylights::to_string(m_params)) << "," << std::endl
-            << "  bsdf_samples = " << m_params.bsdf_samples << "," << std::endl
             << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << ","
             << std::endl
             << "  tree = " << string::indent(m_cache.to_string()) << std::endl

@@ -79,8 +79,8 @@ auto differentiable(Object *object, bool evaluated, const F &f) {
 
 /**
  * Call `f` with all inlined that it calls, but what is MI_NOINLINE: the rare and the long.
- * For scalar variants, where calls of short functions are 5 % of a sample's time with few
- * lights; kernels of JIT variants have no calls.
+ * For scalar variants, where calls of short functions take time; kernels of JIT variants have
+ * none.
  */
 template <typename Float, typename F> [[gnu::flatten]] auto call_inlined(const F &f) {
     return f();

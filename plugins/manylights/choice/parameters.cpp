@@ -8,110 +8,111 @@ namespace manylights {
 namespace {
 
 using mitsuba::Properties;
+using Type = Parameter::Type;
 
-float read_rate(const Properties &props, float fallback) {
-    const std::string name = "splitting_rate";
-    // XML has no spelling of infinity for a float, so a string is welcome too
-    if (props.has_property(name) && props.type(name) == Properties::Type::String) {
-        std::string text = props.get<std::string>(name);
-        if (text != "inf")
-            refuse(props, name, "\"" + text + "\"", "a number >= 0 or \"inf\"");
-        return std::numeric_limits<float>::infinity();
-    }
-    double value = props.get<double>(name, (double) fallback);
-    if (!(value >= 0)) // NaN as well
-        refuse(props, name, std::to_string(value), "a number >= 0 or \"inf\"");
-    return (float) value;
+[[noreturn]] void refuse(const Properties &props, const Parameter &about,
+                         const std::string &value, const std::string &allowed) {
+    manylights::refuse(props, std::string(about.name), value, allowed);
 }
 
-/// The index of a string parameter in the list of what is allowed
-size_t read_choice(const Properties &props, const std::string &name,
-                   const std::vector<std::string> &choices) {
-    std::string value = props.get<std::string>(name, choices[0]), allowed;
-    for (size_t i = 0; i < choices.size(); ++i) {
-        if (value == choices[i])
+std::string quoted(std::string_view text) { return "\"" + std::string(text) + "\""; }
+
+/// Which of the texts it is
+size_t read_text(const Properties &props, const Parameter &about) {
+    std::string value = props.get<std::string>(about.name);
+    for (size_t i = 0; i < about.texts.size(); ++i)
+        if (value == about.texts[i])
             return i;
-        allowed += (i ? " or \"" : "\"") + choices[i] + "\"";
-    }
-    refuse(props, name, "\"" + value + "\"", allowed);
+    refuse(props, about, quoted(value), about.allowed(about.high));
 }
 
-const std::vector<std::string> kMethods  = { "resampled_tree", "talk",
-                                             "adaptive_splitting", "tree", "exhaustive" };
-const std::vector<std::string> kLearning = { "false", "true", "keep" };
-const std::vector<std::string> kSplitFunctions = { "near", "far" };
-
-/// Learning is part of the default method
-LearnVisibility read_learning(const Properties &props, Method method) {
-    const std::string name = "learn_visibility";
-    if (method != Method::ResampledTree) {
-        if (props.has_property(name))
-            refuse(props, name, "given",
-                   "left out unless \"method\" is \"" + kMethods[0] + "\"");
-        return LearnVisibility::No;
+/// The value of a parameter that is given; `high`: the upper end of its range
+double read(const Properties &props, const Parameter &about, double high) {
+    // XML has no spelling of infinity for a float, nor of what a boolean cannot tell
+    bool is_text = props.type(about.name) == Properties::Type::String;
+    if (about.type == Type::Text)
+        return (double) read_text(props, about);
+    if (about.type == Type::Boolean) {
+        if (is_text && !about.texts.empty())
+            return 2. + (double) read_text(props, about);
+        return props.get<bool>(about.name);
     }
-    if (props.has_property(name) && props.type(name) == Properties::Type::String) {
-        std::string text = props.get<std::string>(name);
-        if (text != "keep")
-            refuse(props, name, "\"" + text + "\"", "a boolean or \"keep\"");
-        return LearnVisibility::Keep;
+    if (about.type == Type::Integer) {
+        int64_t value = props.get<int64_t>(about.name);
+        if ((double) value < about.low || (double) value > high)
+            refuse(props, about, std::to_string(value), about.allowed(high));
+        return (double) value;
     }
-    return props.get<bool>(name, true) ? LearnVisibility::Yes : LearnVisibility::No;
+    if (is_text && !about.texts.empty()) {
+        read_text(props, about);
+        return std::numeric_limits<double>::infinity();
+    }
+    double value = props.get<double>(about.name);
+    if (!(value >= about.low)) // NaN as well
+        refuse(props, about, std::to_string(value), about.allowed(high));
+    return value;
 }
 
-/// Parameters that would have no effect are mistakes
-void refuse_unused(const Properties &props, const SamplingParameters &p) {
-    auto refuse_given = [&](const char *name) {
-        if (props.has_property(name))
-            refuse(props, name, "given",
-                   "left out where \"method\" is \"" + kMethods[(size_t) p.method] +
-                       "\"");
-    };
-    bool one_descent = p.method == Method::Tree;
-    if (one_descent || p.method == Method::Exhaustive)
-        refuse_given("splitting_rate");
-    if (one_descent || p.traces_all()) {
-        refuse_given("reservoirs");
-        refuse_given("shadow_rays");
-    }
-    if (props.has_property("split_function") && p.method != Method::Talk)
-        refuse(props, "split_function",
-               "\"" + kSplitFunctions[(size_t) p.split_function] + "\"",
-               "left out unless \"method\" is \"talk\"");
+/// What would have no effect is a mistake
+void refuse_unused(const Properties &props, const Parameter &about, Method method) {
+    if (about.is_for(method))
+        return;
+    bool is_text      = about.type == Type::Text;
+    std::string value = is_text ? quoted(about.texts[read_text(props, about)]) : "given";
+    bool is_for_one   = about.methods.size() == 1;
+    refuse(props, about, value,
+           std::string("left out ") + (is_for_one ? "unless" : "where") +
+               " \"method\" is " +
+               quoted(name_of(is_for_one ? about.methods[0] : method)));
 }
 
-/// What all integrators have in common
-SamplingParameters read_light_parameters(const Properties &props) {
-    SamplingParameters p;
-    p.method         = (Method) read_choice(props, "method", kMethods);
-    p.splitting_rate = read_rate(props, p.splitting_rate);
-    p.reservoirs     = read_count(props, "reservoirs", p.reservoirs, 1, kMaxReservoirs);
-    p.shadow_rays    = read_count(props, "shadow_rays",
-                                  std::min(p.shadow_rays, p.reservoirs), 1, p.reservoirs);
-    p.split_function =
-        (SplitFunction) read_choice(props, "split_function", kSplitFunctions);
-    p.counts           = props.get<bool>("counts", false);
-    p.learn_visibility = read_learning(props, p.method);
-    refuse_unused(props, p);
+/// Call f(name, member) for all parameters that we read; those whose values others depend on first
+template <typename Params, typename F> void for_each_member(Params &p, const F &f) {
+    f("method", p.method);
+    f("split_function", p.split_function);
+    f("splitting_rate", p.splitting_rate);
+    f("reservoirs", p.reservoirs);
+    f("shadow_rays", p.shadow_rays);
+    f("learn_visibility", p.learn_visibility);
+    f("counts", p.counts);
+    f("bsdf_samples", p.bsdf_samples);
+}
+
+SamplingParameters read(const Properties &props, Plugins plugin) {
+    SamplingParameters p{};
+    p.plugin = plugin;
+    for_each_member(p, [&](std::string_view name, auto &member) {
+        using Value            = std::decay_t<decltype(member)>;
+        const Parameter &about = parameter(name);
+        double high   = about.high_name == "reservoirs" ? p.reservoirs : about.high;
+        double value  = std::min(about.fallback, high);
+        bool is_given = (about.plugins & plugin) && props.has_property(name);
+        if (is_given) {
+            refuse_unused(props, about, p.method);
+            value = read(props, about, high);
+        }
+        member = (Value) value;
+    });
+    // What the method does without
     if (p.method == Method::Exhaustive)
         p.splitting_rate = std::numeric_limits<float>::infinity();
     if (p.method == Method::Tree)
         p.splitting_rate = 0.f;
-    if (p.method == Method::Tree || p.traces_all())
+    if (!parameter("reservoirs").is_for(p.method))
         p.reservoirs = p.shadow_rays = 1;
+    if (!parameter("learn_visibility").is_for(p.method))
+        p.learn_visibility = LearnVisibility::No;
     return p;
 }
 
 } // namespace
 
 SamplingParameters read_parameters(const Properties &props) {
-    SamplingParameters p = read_light_parameters(props);
-    p.bsdf_samples       = read_count(props, "bsdf_samples", p.bsdf_samples, 0, 1024);
-    return p;
+    return read(props, kDirect);
 }
 
 SamplingParameters read_path_parameters(const Properties &props) {
-    SamplingParameters p = read_light_parameters(props);
+    SamplingParameters p = read(props, kVolpath);
     p.deeper_candidates  = 3.f / 8.f;
     p.deeper_rays        = 1.f / 4.f;
     return p;
@@ -127,16 +128,12 @@ std::vector<std::string> count_channels(const SamplingParameters &p) {
 
 std::string to_string(const SamplingParameters &p) {
     std::ostringstream oss;
-    oss << "method = " << kMethods[(size_t) p.method];
-    if (p.method == Method::Talk)
-        oss << ",\nsplit_function = " << kSplitFunctions[(size_t) p.split_function];
-    if (p.method != Method::Tree && p.method != Method::Exhaustive)
-        oss << ",\nsplitting_rate = " << p.splitting_rate;
-    if (p.method != Method::Tree && !p.traces_all())
-        oss << ",\nreservoirs = " << p.reservoirs << ",\nshadow_rays = " << p.shadow_rays;
-    if (p.method == Method::ResampledTree)
-        oss << ",\nlearn_visibility = " << kLearning[(size_t) p.learn_visibility];
-    oss << ",\ncounts = " << (p.counts ? "true" : "false");
+    for_each_member(p, [&](std::string_view name, const auto &member) {
+        const Parameter &about = parameter(name);
+        if (about.is_for(p.method) && (about.plugins & p.plugin))
+            oss << (oss.tellp() > 0 ? ",\n" : "") << name << " = "
+                << about.text_of((double) member);
+    });
     return oss.str();
 }
 

@@ -1,35 +1,44 @@
 #pragma once
 
 /**
- * The parameters of the estimator, shared by all integrators: one reader, so that names,
- * ranges and error messages cannot differ.
+ * The values of the parameters, shared by all integrators. Names, ranges and defaults are in
+ * parameter_table.cpp.
  */
 
-#include "reservoirs.h"
+#include "parameter_table.h"
+#include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <limits>
 #include <mitsuba/core/properties.h>
 #include <string>
 #include <vector>
 
 namespace manylights {
 
-/// Where candidates come from, and what becomes of them
-enum class Method { ResampledTree, Talk, AdaptiveSplitting, Tree, Exhaustive };
+/// K above which systematic sampling would lose the fraction of a float: visit all lights
+constexpr float kMaxExpectedCandidates = 1 << 14;
+/// K for a splitting rate of 1
+constexpr float kCandidatesPerRate = 8.f;
+
+/// What decides whether a node is split: the talk's two functions, or the variance
+enum class SplitFunction { Near, Far, Variance };
 
 /// Is the lights' visibility learnt in each rendering, and is it kept for the next one?
 enum class LearnVisibility { No, Yes, Keep };
 
 /// See the documentation of the plugin manylights_direct
 struct SamplingParameters {
-    Method method                = Method::ResampledTree;
-    SplitFunction split_function = SplitFunction::Near;
-    float splitting_rate         = 1.f;
-    uint32_t reservoirs = 8, shadow_rays = 4, bsdf_samples = 1;
+    Plugins plugin;
+    Method method;
+    SplitFunction split_function;
+    float splitting_rate;
+    uint32_t reservoirs, shadow_rays, bsdf_samples;
     /// What the vertices of a path after its first one get of candidates and shadow rays
     float deeper_candidates = 1.f, deeper_rays = 1.f;
     /// Are the candidates and the visited nodes counted, in film channels?
-    bool counts                      = false;
-    LearnVisibility learn_visibility = LearnVisibility::Yes;
+    bool counts;
+    LearnVisibility learn_visibility;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
@@ -66,16 +75,15 @@ SamplingParameters read_parameters(const mitsuba::Properties &props);
  * The same for paths, where one direction is sampled at each vertex (no `bsdf_samples`).
  *
  * After the first vertex paths spend 3/8 of the candidates and a quarter of the shadow rays,
- * that is K = 3 and s = 1 by default. At depth 6 and equal time (llvm_ad_rgb, 1,000 lights)
- * K, s = 8, 4 / 8, 1 / 3, 1 / 2, 1 / 1, 1 had 68 / 71 / 101 / 86 / 55 times less error than
- * `path` in rooms, and 6.4 / 7.7 / 9.1 / 10.1 / 9.4 times in a city of points.
+ * that is K = 3 and s = 1 by default: their light is dimmer, and the rays that lead to them cost
+ * as much as shadow rays.
  */
 SamplingParameters read_path_parameters(const mitsuba::Properties &props);
 
 /// Names of the film channels with counts
 std::vector<std::string> count_channels(const SamplingParameters &params);
 
-/// "name = value" lines
+/// "name = value" lines of what has an effect
 std::string to_string(const SamplingParameters &params);
 
 } // namespace manylights

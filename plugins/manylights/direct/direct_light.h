@@ -3,7 +3,7 @@
 /**
  * Direct light at a shading point: candidates -> reservoirs -> shadow rays.
  *
- * Stage 1, candidates.h: N' lights, each with its inclusion probability p.
+ * Stage 1, choice/candidate.h: N' lights, each with its inclusion probability p.
  * Stage 2, kept_lights.h: at most m lights, resampled by the heuristic H. If there cannot be
  *   more than m candidates, all are kept with C = 1 / p and nothing is resampled.
  * Stage 3, light_samples.h and shadow_rays.h: a point on each kept light, and a ray to some.

@@ -94,6 +94,7 @@ private:
                 return on && s.cursor.has_next() && s.slot < m_strategy.slots;
             },
             [&](State &s) {
+                // Keep the next candidate
                 auto candidate = s.cursor.next(m_lights.tree(), vertex.at, s.rng);
                 FloatD p = candidate.probability, weight = dr::rcp(p);
                 MaskD valid = candidate.valid;
@@ -102,6 +103,7 @@ private:
                                     valid);
                 write_slot<FloatD>(kept.weight, s.slot, weight, m_strategy.slots, valid);
                 write_slot<FloatD>(kept.probability, s.slot, p, m_strategy.slots, valid);
+                // Evaluate its target, by which shadow rays are chosen
                 if (m_strategy.chooses) {
                     FloatD g = light_target(vertex, candidate.light, p, s.slot, kept,
                                             active && valid) *

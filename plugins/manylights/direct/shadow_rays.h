@@ -37,6 +37,7 @@ public:
 
     /// A shadow ray for each kept light, or for some of them
     MI_NOINLINE Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
+        // Find the step tau of the systematic sampling, lights at infinity included
         InfiniteSamples infinite = m_samples.sample_infinite(vertex, active);
         FloatD offset            = plain(vertex.u.selection);
         FloatD tau(0.f);
@@ -55,6 +56,7 @@ public:
             Rng rng;
             DRJIT_STRUCT(State, ray, result, rng)
         };
+        // Trace a ray to each item that is chosen; an item below tau gets what others lack
         State state{ UInt32D(0), Spectrum(0.f), media_rng(vertex) };
         UInt32D rays = dr::minimum(vertex.effort.shadow_rays, m_strategy.items);
         MaskD on     = plain(active);

@@ -9,7 +9,7 @@
  *     any, N <= m                     AllLights               KeepAll
  *     resampled_tree, K <= m; tree    Systematic              KeepAll
  *     resampled_tree, K > m           Systematic              Resample
- *     exhaustive, N > m               AllLights               Resample (s = m: TraceAll)
+ *     exhaustive, N > m               AllLights               Resample
  *     talk                            Splitting               Resample
  *     adaptive_splitting              Splitting               TraceAll
  *
@@ -17,7 +17,10 @@
  * so that they cannot disagree.
  */
 
-#include "manylights/choice/parameters.h"
+#include "manylights/base/slots.h"
+#include "manylights/choice/all_lights.h"
+#include "manylights/choice/splitting.h"
+#include "manylights/choice/systematic.h"
 #include "vertex.h"
 #include <algorithm>
 
@@ -57,7 +60,7 @@ template <typename FloatD> struct AllLightsSource {
     FloatD inclusion_probability(const TreeView<FloatD> &, const Receiver<FloatD> &,
                                  const UInt32D &, const FloatD &, const MaskD &,
                                  const MaskD &) const {
-        return FloatD(1.f);
+        return AllLights<FloatD>::inclusion_probability();
     }
 };
 
@@ -73,8 +76,8 @@ template <typename FloatD> struct SystematicSource {
     FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
                                  const UInt32D &light, const FloatD &, const MaskD &first,
                                  const MaskD &active) const {
-        return dr::minimum(1.f, effort_of<FloatD>(params, first).candidates *
-                                    leaf_probability(tree, at, light, active));
+        return SystematicCursor<FloatD>::inclusion_probability(
+            tree, at, light, effort_of<FloatD>(params, first).candidates, active);
     }
 };
 
@@ -144,7 +147,7 @@ struct Strategy {
         infinite_probability = few ? 1.f : 1.f / infinite_lights;
     }
 
-    /// With enough shadow rays for all lights nothing has to be chosen. Kernels are the same
+    /// With slots and shadow rays for all lights nothing has to be chosen. Kernels are the same
     /// for all vertices, scalar variants look at each.
     template <typename FloatD> Fate fate_at(const Effort<FloatD> &effort) const {
         bool enough;
@@ -152,7 +155,8 @@ struct Strategy {
             enough = !chooses;
         else
             enough = items <= effort.shadow_rays;
-        return source == Source::AllLights && enough ? Fate::TraceAll : fate;
+        bool all_kept = source == Source::AllLights && fate == Fate::KeepAll;
+        return all_kept && enough ? Fate::TraceAll : fate;
     }
 
     /// Call f with the source of candidates
@@ -162,9 +166,10 @@ struct Strategy {
                 return f(SystematicSource<FloatD>{ params });
             case Source::Splitting:
                 return f(SplittingSource<FloatD>{ params });
-            default:
-                return f(AllLightsSource<FloatD>{ params });
+            case Source::AllLights:
+                break;
         }
+        return f(AllLightsSource<FloatD>{ params });
     }
 };
 

@@ -5,7 +5,10 @@
  * Lights are numbered as in the input, whatever order the tree gives them.
  */
 
+#include "manylights/choice/parameter_table.h"
 #include "manylights/choice/reservoirs.h"
+#include "manylights/choice/splitting.h"
+#include "manylights/choice/systematic.h"
 #include "manylights/emission/brightness_map.h"
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -272,6 +275,32 @@ float mean_brightness(const BrightnessMap &map, const Corners &corners) {
     return map.mean(polygon, count);
 }
 
+/// The parameters of a plugin, for the test that compares them with what users are told
+nb::list parameters(const std::string &plugin) {
+    unsigned wanted = plugin == "manylights_direct" ? kDirect : kVolpath;
+    nb::list result;
+    for (const Parameter &each : parameter_table()) {
+        if (!(each.plugins & wanted))
+            continue;
+        const char *types[] = { "bool", "int", "float", "string" };
+        std::vector<std::string> methods, texts(each.texts.begin(), each.texts.end());
+        for (Method method : each.methods)
+            methods.emplace_back(name_of(method));
+        nb::dict about;
+        about["name"]      = std::string(each.name);
+        about["type"]      = types[(size_t) each.type];
+        about["default"]   = each.text_of(each.fallback);
+        about["low"]       = each.low;
+        about["high"]      = each.high;
+        about["high_name"] = std::string(each.high_name);
+        about["texts"]     = texts;
+        about["methods"]   = methods;
+        about["meaning"]   = std::string(each.meaning);
+        result.append(about);
+    }
+    return result;
+}
+
 } // namespace
 
 NB_MODULE(_core, m) {
@@ -319,6 +348,8 @@ NB_MODULE(_core, m) {
              "Mean over a triangle (3, 2) or convex quadrilateral (4, 2); the image is "
              "the "
              "unit square.");
+    m.def("parameters", &parameters, "plugin"_a,
+          "What the parameters of a plugin may be: a dictionary each.");
     m.def("select", &select_items, "targets"_a, "picks"_a, "offset"_a,
           "Threshold-systematic selection: chosen items, and weights max(1, tau / "
           "target).");

@@ -32,6 +32,7 @@ public:
     };
 
     SceneLights(const Scene *scene, bool keep_binary) {
+        // Read the emitters
         Stopwatch stopwatch;
         Table table = LightTableReader<Float, Spectrum>::read(scene);
         m_infinite  = std::move(table.infinite);
@@ -50,6 +51,7 @@ public:
         m_media            = MediumReader<Float, Spectrum>::find(scene);
         m_tree.light_count = (uint32_t) table.rows.size();
 
+        // Build the tree into memory that kernels can read
         HostStorage<Storage> nodes;
         WideNode *nodes_begin = nullptr;
         auto node_memory      = [&](size_t count) {
@@ -65,6 +67,7 @@ public:
             dr::load<IndexStorage>(tree.node_link.data(), tree.node_link.size());
         m_tree.binary = or_empty(dr::load<Storage>(
             tree.binary.data(), tree.binary.size() * kBinaryNodeFloats));
+        // Put rows and primitives into the order of the tree
         make_rows(table, tree);
         make_map(table, tree);
         if constexpr (dr::is_jit_v<Float>)

@@ -39,9 +39,7 @@ constexpr float kNarrowestBeam = 1e-3f;
  * Emission in the direction -w / |w|, where inv_norm is 1 / e, relative to its mean.
  *
  * Broad: the first harmonics, the last one with 3/4 in place of the 5/8 of a cosine, so that less
- * is left where all lights of a cluster are seen edge-on: 60 lamps in the plane of the receiver
- * have .008 in place of .016 of relative variance, 1,000 and 10,000 triangles of a city .98 and
- * 1.02 times that of 5/8 (with 1: 1.05 and 1.15 times).
+ * is left where all lights of a cluster are seen edge-on.
  *
  * Beams: a von Mises-Fisher lobe about the axis whose concentration k follows from the axis'
  * length r (Banerjee et al. 2005) and from the angle that the cluster fills:

@@ -5,14 +5,14 @@
  * those of the root's grandchildren, and below them those of a node's four children.
  *
  * Conty Estevez, Hellmuth and Lecocq, "A Resampled Tree for Many Lights Rendering",
- * SIGGRAPH Talks 2024, section 2. Candidates are drawn in candidates.h.
+ * SIGGRAPH Talks 2024, section 2. Candidates are drawn in choice/.
  *
  * All of this works on detached numbers: choices carry no derivative.
  */
 
 #include "cluster_importance.h"
-#include "manylights/learning/visibility.h"
 #include "manylights/kinds/row.h"
+#include "manylights/learning/visibility.h"
 #include "tree_builder.h"
 #include <array>
 #include <drjit/dynamic.h>
@@ -203,9 +203,7 @@ template <typename Float>
 Four<Float> defensive_weights(const Four<Float> &flux, const Four<Float> &h,
                               const Float &importance) {
     /* On top of a light h overflows, very far away it vanishes: then the flux alone decides.
-       (A least variance for all clusters, 1e-6 of the scene's extent squared, would do the
-       same, but blurs lights: .055 in place of .012 of relative variance where some of them
-       are 1e6 times as far away as others, 1.5 in place of .025 at 1e-6 units from one.) */
+       A least variance for all clusters would do the same, but blur lights that are near. */
     auto usable = importance > 1e-30f && importance < 1e30f;
     // A power of two brings the sum to [1, 2): small shares of the flux would vanish
     using UInt32 = dr::uint32_array_t<Float>;
@@ -327,14 +325,17 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
     loop(
         state, [](const State &s) { return s.active; },
         [&](State &s) {
+            // Look at the node where the light, or the node below, hangs
             UInt32 index = s.link >> 2u, slot = s.link & 3u;
             WideNodeView<Float> node(tree, index, true);
-            // The root's grandchildren are compared with each other
+            // The root's grandchildren are compared with each other: their fluxes are parts of
+            // that of the whole tree
             Mask root = index == 0u, top = root || s.above < 4u;
             Float share(1.f);
             for (uint32_t i = 0; i < 4; ++i)
                 share = dr::select(!root && s.above == i, tree.top.share[i], share);
             node.clusters.flux *= share;
+            // Weigh the children as the descent does
             Four<Float> h      = cluster_importance(at, node.clusters, tree.directions);
             Four<Float> weight = defensive_weights<Float>(
                 node.clusters.flux, h,
@@ -342,6 +343,7 @@ Float leaf_probability(const TreeView<Float> &tree, const Receiver<Float> &at,
             if (root_visibility)
                 weight *= tree.top_factors(at, *root_visibility,
                                            dr::select(root, slot, s.above & 3u), index);
+            // Multiply with the probability of this child, and go up
             Float total = dr::select(top, at.top_total, sum_of<Float>(weight));
             s.probability *= pick<Float>(weight, slot) / total;
             s.active &= !top;

@@ -51,7 +51,7 @@ SAMPLING_PARAMETERS = {
     "splitting_rate": Parameter("float >= 0 or inf", 1.0, symbol="gamma"),
     "reservoirs": Parameter("integer from 1 to 64", 8, symbol="m"),
     "shadow_rays": Parameter("integer from 1 to the number of reservoirs", 4, symbol="s"),
-    "method": Parameter(", ".join(METHODS), METHODS[0]),
+    "method": Parameter(f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", METHODS[0]),
     "split_function": Parameter("near or far", "near", "for method=talk only"),
     "learn_visibility": Parameter("true, false or keep", True, f"for method={METHODS[0]} only"),
     "counts": Parameter(BOOLEAN, False, f"adds channels {', '.join(channels.COUNTS)}"),
@@ -61,7 +61,7 @@ SAMPLING_PARAMETERS = {
 PARAMETERS = {
     DIRECT: {
         **SAMPLING_PARAMETERS,
-        "bsdf_samples": Parameter("integer >= 0", 1),
+        "bsdf_samples": Parameter("integer from 0 to 1024", 1),
         "hide_emitters": HIDE_EMITTERS,
     },
     VOLPATH: {
