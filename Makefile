@@ -22,12 +22,17 @@ CPP_DIRS := $(wildcard ext plugins tests)
 VARIANTS_ID := $(shell printf '%s' "$$MANYLIGHTS_VARIANTS" | cksum | cut -d ' ' -f 1)
 INSTALLED   := $(VENV)/.installed-$(VARIANTS_ID)
 
+# What `make demo` needs, so that it does not wait for the others. Where all are there already,
+# or where somebody chose, it takes those.
+DEMO_VARIANTS  := scalar_rgb,llvm_ad_rgb
+DEMO_INSTALLED := $(if $(MANYLIGHTS_VARIANTS)$(wildcard $(INSTALLED)),$(INSTALLED),$(VENV)/.installed-demo)
+
 .PHONY: help
 help:  ## Show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 23
 
 .PHONY: demo
-demo: $(INSTALLED)  ## Render a city with more than 10,000 lights to demo.exr and demo.png
+demo: $(DEMO_INSTALLED)  ## Render a city with more than 10,000 lights to demo.exr and demo.png
 	$(BIN)/manylights demo -o demo
 
 .PHONY: build
@@ -98,9 +103,8 @@ clean:  ## Delete everything that was built, .venv too
 
 # pip 25.1 is the first that can install the dependency groups of pyproject.toml.
 $(VENV)/.created:
-	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || { rm -rf $(VENV); \
-	  echo "Could not make a virtual environment. On Debian and Ubuntu, type"; \
-	  echo "  sudo apt-get install python3-venv"; exit 1; } >&2
+	@PYTHON="$(PYTHON)" ext/missing-packages tools
+	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || { rm -rf $(VENV); exit 1; }
 	$(PIP) install --quiet --upgrade 'pip>=25.1'
 	@touch $@
 
@@ -108,18 +112,24 @@ $(VENV)/.dev-tools: pyproject.toml | $(VENV)/.created
 	$(PIP) install --quiet --group dev
 	@touch $@
 
-$(VENV)/.build-tools: pyproject.toml | $(VENV)/.created
-	@command -v $${CXX:-c++} >/dev/null || { \
-	  echo "There is no C++ compiler. On Debian and Ubuntu, type"; \
-	  echo "  sudo apt-get install g++"; exit 1; } >&2
-	@test -e "$$($(BIN)/python -c 'import sysconfig as s; print(s.get_path("include"))')/Python.h" \
-	  || { echo "Python.h is missing: tests of the C++ parts will be skipped. To run them, type"; \
-	       echo "  sudo apt-get install python3-dev"; } >&2
+# Asked before the virtual environment is made, which has its own package.
+build/.system-packages: ext/missing-packages
+	@PYTHON="$(PYTHON)" ext/missing-packages build
+	@mkdir -p build && touch $@
+
+$(VENV)/.build-tools: pyproject.toml | build/.system-packages $(VENV)/.created
 	$(PIP) install --quiet --group build
 	@touch $@
 
 # Without build isolation the paths of the headers stay the same, and with them the objects.
+INSTALL := $(PIP) install --quiet --no-build-isolation -C build-dir=$(BUILD_DIR)
+
 $(INSTALLED): $(VENV)/.build-tools $(SOURCES)
 	@echo "Compiling the plugins. The first time takes some minutes."
-	$(PIP) install --quiet --no-build-isolation -C build-dir=$(BUILD_DIR) '.[test,bench]'
+	$(INSTALL) -C cmake.define.MANYLIGHTS_BINDINGS=ON '.[test,bench]'
+	@rm -f $(VENV)/.installed-* && touch $@
+
+$(VENV)/.installed-demo: $(VENV)/.build-tools $(SOURCES)
+	@echo "Compiling the plugins for $(DEMO_VARIANTS). The first time takes a minute or two."
+	MANYLIGHTS_VARIANTS=$(DEMO_VARIANTS) $(INSTALL) -C cmake.define.MANYLIGHTS_BINDINGS=OFF .
 	@rm -f $(VENV)/.installed-* && touch $@
