@@ -20,6 +20,7 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from manylights.threads import threads_for_files
 
 SCENES = Path(__file__).parents[1] / "scenes"
 VARIANTS = "scalar_rgb,scalar_spectral,llvm_ad_rgb,llvm_ad_mono_polarized"
@@ -80,7 +81,9 @@ def hashes(variant: str, wanted: set[str] | None = None) -> dict[str, str]:
         if wanted and name not in wanted:
             continue
         try:
-            scene = load()
+            # With one thread Mitsuba waits for ever for some files
+            with threads_for_files():
+                scene = load()
         except RuntimeError as error:
             if "Unsupported spectrum type" not in str(error):
                 raise
