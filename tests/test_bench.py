@@ -19,9 +19,11 @@ from manylights.bench import (
     methods,
     records,
     runner,
+    samplers,
     scene_source,
     standard,
 )
+from manylights.bench.drawing import Drawing
 from manylights.bench.folder import open_folder
 from manylights.bench.methods import Kind, Method
 from manylights.bench.moments import Moments
@@ -51,7 +53,7 @@ FEW = (
 )
 
 SERIES_KEYS = {
-    *("spec", "method", "parameters", "integrator", "build_seconds", "first_seconds"),
+    *("spec", "method", "parameters", "integrator", "sampler", "build_seconds", "first_seconds"),
     *("equal_time", "points"),
 }
 POINT_KEYS = {"spp", "seed", "seconds", "cpu_seconds", "error", "error_trimmed", "flip", "mean"}
@@ -103,6 +105,7 @@ def test_results_have_the_promised_keys(measured):
     assert (scene["lights"], scene["width"], scene["height"], scene["max_depth"]) == (40, 32, 18, 2)
     for series in scene["series"]:
         assert set(series) == SERIES_KEYS
+        assert (series["sampler"] == "manylights_sobol") == (series["method"] in methods.OURS)
         assert [point["spp"] for point in series["points"]] == [1, 2]
         for point in series["points"]:
             assert set(point) == POINT_KEYS
@@ -154,8 +157,9 @@ def test_errors_and_variances_are_those_of_the_renders(measured):
     mi.set_variant("scalar_rgb")
     loaded = scene_source.find(CITY).load()
     integrator = mi.load_dict({"type": "manylights_direct"})
+    sensor = loaded.sensors[samplers.OURS]
     images = [
-        np.array(mi.render(loaded.scene, integrator=integrator, spp=2, seed=seed))
+        np.array(mi.render(loaded.scene, sensor=sensor, integrator=integrator, spp=2, seed=seed))
         for seed in (1, 2)
     ]
     (series,) = [s for s in data["scenes"][0]["series"] if s["method"] == "resampled_tree"]
@@ -296,10 +300,10 @@ def test_no_tree_is_built_on_the_clock_after_power_sampling(tmp_path, llvm, monk
     """With an environment each change of the weights makes the emitters look new to the tree."""
     built = []
 
-    def watched(loaded, integrator, spp, seed):
+    def watched(loaded, integrator, spp, seed, sampler):
         ours = "build_ms" in mi.traverse(integrator)
         before = build_time(integrator) if ours else 0.0
-        result = drawing.draw(loaded, integrator, spp, seed)
+        result = drawing.draw(loaded, integrator, spp, seed, sampler)
         if ours and seed <= 2:
             built.append(build_time(integrator) != before)
         return result
@@ -513,13 +517,53 @@ def test_sources_of_generators(scalar_variant):
     assert scene_source.find(f"on_emitter,{TINY}").load().lights == 6
 
 
-def test_samplers_become_independent(tmp_path, scalar_variant):
+SAMPLER_CLASSES = ("Independent", "Multijitter", "Orthogonal", "LowDiscrepancy", "Sobol")
+
+
+def assert_sensors(loaded):
+    """There is one sensor for each sampler, all alike."""
+    names = [sensor.sampler().class_name() for sensor in loaded.sensors.values()]
+    assert names == [f"{name}Sampler" for name in SAMPLER_CLASSES]
+    assert list(loaded.sensors) == list(samplers.NAMES)
+    places = [np.array(s.world_transform().matrix) for s in loaded.sensors.values()]
+    assert all(np.array_equal(place, places[0]) for place in places)
+
+
+def test_scenes_get_a_sensor_for_each_sampler(tmp_path, scalar_variant):
     text = (SCENES / "points.xml").read_text()
     path = tmp_path / "scene.xml"
     path.write_text(text.replace('"independent"', '"multijitter"'))
     assert 'sampler type="multijitter"' in path.read_text()
-    scene = scene_source.find(str(path)).load().scene
-    assert "Independent" in scene.sensors()[0].sampler().class_name()
+    assert_sensors(scene_source.find(str(path)).load())
+    assert_sensors(scene_source.find(f"rooms:20,{TINY}").load())
+
+
+def test_numbers_of_samples_that_are_not_rounded(scalar_variant):
+    asked = [1, 3, 4, 16, 24, 64]
+    for name, expected in (
+        ("independent", asked),
+        ("ldsampler", [1, 1, 4, 16, 16, 64]),
+        ("manylights_sobol", asked),
+    ):
+        sampler = mi.load_dict({"type": name})
+        assert [samplers.allowed(sampler, spp) for spp in asked] == expected
+
+
+def test_the_best_sampler_is_chosen(scalar_variant):
+    """By error times time, among those that do not round."""
+    loaded = scene_source.find(f"rooms:20,{TINY}").load()
+    noise = {"independent": (1.0, 1.0), "multijitter": (0.4, 2.0), "ldsampler": (0.6, 3.0)}
+    asked = set()
+
+    def render(name, spp, number):
+        asked.add((name, spp))
+        error, seconds = noise[name]
+        image = np.full((4, 4, 3), 10.0) + (2 * number - 1) * error
+        return Drawing(image, seconds, seconds)
+
+    assert samplers.choose(loaded.sensors, [1, 4, 16], render) == "multijitter"
+    assert asked == {(name, 16) for name in noise}
+    assert samplers.choose(loaded.sensors, [1], render) == "independent"
 
 
 def test_scenes_of_one_name_get_numbers(tmp_path, scalar_variant):
@@ -622,8 +666,8 @@ def test_importing_the_package_imports_no_extra():
 def test_a_method_with_broken_pixels_is_left_out(tmp_path, monkeypatch):
     render = drawing._render
 
-    def spoilt(loaded, integrator, spp, seed):
-        pixels = render(loaded, integrator, spp, seed)
+    def spoilt(loaded, integrator, spp, seed, sampler):
+        pixels = render(loaded, integrator, spp, seed, sampler)
         if seed == 2 and not str(integrator).startswith("ManyLights"):
             pixels[3, 4] = np.nan
         return pixels

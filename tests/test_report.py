@@ -113,7 +113,7 @@ def series_of(points, method="talk", **parameters):
         spread = np.array([0.99, 1.0, 1.01])
         errors = error * spread
         made.append(records.Point(spp, seconds * np.ones(3), np.ones(3), errors, errors, spread))
-    return records.Series(method, method, parameters, 0.0, 0.0, None, made)
+    return records.Series(method, method, parameters, None, 0.0, 0.0, None, made)
 
 
 def scene_of(*series, error=0.0, mean=1.0, mean_error=0.0):

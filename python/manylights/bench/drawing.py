@@ -29,7 +29,7 @@ class Drawing:
     cpu_seconds: float
 
 
-def draw(loaded: MeasuredScene, integrator, spp: int, seed: int) -> Drawing:
+def draw(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -> Drawing:
     """Render a scene and measure how long that takes, until the pixels are in memory.
 
     Args:
@@ -37,13 +37,14 @@ def draw(loaded: MeasuredScene, integrator, spp: int, seed: int) -> Drawing:
         integrator: what ``mi.load_dict`` returned.
         spp: samples per pixel, at least 1.
         seed: of the random numbers.
+        sampler: one that the scene has.
 
     Raises:
         BrokenImage: a pixel is infinite or not a number.
         UsageError: the film has no colours.
     """
     start, cpu_start = time.perf_counter(), time.process_time()
-    pixels = _render(loaded, integrator, spp, seed)
+    pixels = _render(loaded, integrator, spp, seed, sampler)
     seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
     image = _colors(pixels)
     broken = int(np.sum(~np.isfinite(image).all(axis=2)))
@@ -61,7 +62,7 @@ def draw_channels(
     return pixels[..., [added.index(name) - len(added) for name in names]]
 
 
-def _render(loaded: MeasuredScene, integrator, spp: int, seed: int) -> np.ndarray:
+def _render(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -> np.ndarray:
     """Render in as many passes as the memory needs; each sample has the same weight."""
     width, height = loaded.size
     plan = plans.whole(spp, seed)
@@ -70,7 +71,8 @@ def _render(loaded: MeasuredScene, integrator, spp: int, seed: int) -> np.ndarra
         plan = plans.split(spp, width * height, seed, scalar=False)
     total = 0.0
     for part in plan.passes:
-        pixels = integrator.render(loaded.scene, sensor=0, seed=part.seed, spp=part.spp)
+        sensor = loaded.sensors[sampler]
+        pixels = integrator.render(loaded.scene, sensor, part.seed, part.spp)
         total = total + np.array(pixels) * (part.spp / spp)
     return total
 

@@ -58,6 +58,7 @@ SERIES = {
     "method": str,
     "parameters": dict,
     "integrator": dict,
+    "sampler": Maybe(str),
     "build_seconds": NUMBER,
     "first_seconds": NUMBER,
     "equal_time": Maybe(EQUAL_TIME),
@@ -120,6 +121,7 @@ class Series:
     spec: str
     method: str
     parameters: dict[str, Any]
+    sampler: str | None
     build_seconds: float
     first_seconds: float
     equal_time: dict[str, Any] | None
@@ -187,7 +189,11 @@ def new_point(spp: int) -> dict[str, Any]:
 
 
 def new_series(
-    spec: str, method: str, parameters: dict[str, Any], integrator: dict[str, Any]
+    spec: str,
+    method: str,
+    parameters: dict[str, Any],
+    integrator: dict[str, Any],
+    sampler: str,
 ) -> dict[str, Any]:
     """Return an entry for a method that has not been rendered."""
     return {
@@ -195,6 +201,7 @@ def new_series(
         "method": method,
         "parameters": parameters,
         "integrator": integrator,
+        "sampler": sampler,
         "build_seconds": 0.0,
         "first_seconds": 0.0,
         "equal_time": None,

@@ -15,7 +15,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.bench import methods, metrics
+from manylights.bench import methods, metrics, samplers
 from manylights.bench.drawing import draw
 from manylights.bench.moments import Moments
 from manylights.bench.scene_source import MeasuredScene
@@ -46,10 +46,10 @@ def render(
     method = methods.Method(methods.OURS[0])
     description = methods.integrator_for(method, loaded.kind)
     integrator = mi.load_dict(description)
-    draw(loaded, integrator, spp, FIRST_SEED + PASSES)
+    draw(loaded, integrator, spp, FIRST_SEED + PASSES, samplers.OURS)
     moments, means, seconds = Moments(), [], 0.0
     for index in range(PASSES):
-        drawing = draw(loaded, integrator, spp, FIRST_SEED + index)
+        drawing = draw(loaded, integrator, spp, FIRST_SEED + index, samplers.OURS)
         moments.add(index, drawing.image)
         means.append(float(drawing.image.mean(dtype=float)))
         seconds += drawing.seconds

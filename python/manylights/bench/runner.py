@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights.bench import calibration, metrics, records, reference
+from manylights.bench import calibration, metrics, records, reference, samplers
 from manylights.bench.drawing import BrokenImage, Drawing, draw, draw_channels
 from manylights.bench.folder import Folder, is_skipped, series_of, skip, unskip
 from manylights.bench.methods import EXHAUSTIVE_LIGHTS, Method, integrator_for
@@ -96,6 +96,15 @@ class Candidate:
     integrator: Any
     series: dict[str, Any]
     times: dict[int, float]
+
+    @property
+    def sampler(self) -> str:
+        """Name of the sampler; earlier results had one for all methods."""
+        return self.series.get("sampler") or samplers.MITSUBAS[0]
+
+    def sampler_of(self, spp: int) -> str:
+        """Return the sampler for a number of samples: some of Mitsuba's would round 1."""
+        return self.sampler if spp > 1 or self.method.is_ours else samplers.MITSUBAS[0]
 
     @property
     def spps(self) -> list[int]:
@@ -185,9 +194,9 @@ class SceneRun:
             if method.name == "power":
                 return self._draw_by_power(candidate, spp, seed)
             if method.spec in self.stale:
-                draw(self.loaded, candidate.integrator, 1, CALIBRATION_SEED)
+                draw(self.loaded, candidate.integrator, 1, CALIBRATION_SEED, candidate.sampler)
                 self.stale.discard(method.spec)
-            return draw(self.loaded, candidate.integrator, spp, seed)
+            return draw(self.loaded, candidate.integrator, spp, seed, candidate.sampler_of(spp))
         except RuntimeError as error:
             where = f"{self.entry['name']}, {method.spec}"
             raise UsageError(f"{where}: {one_line(error)}") from error
@@ -195,7 +204,7 @@ class SceneRun:
     def _draw_by_power(self, candidate: Candidate, spp: int, seed: int) -> Drawing:
         scene = self.loaded.scene
         with power_sampling(scene, self.weights):
-            drawing = draw(self.loaded, candidate.integrator, spp, seed)
+            drawing = draw(self.loaded, candidate.integrator, spp, seed, candidate.sampler_of(spp))
         # Mitsuba tells environments about each change, which makes them look new to our trees.
         if scene.environment() is not None:
             self.stale = {method.spec for method in self.task.methods if method.is_ours}
@@ -225,7 +234,11 @@ class SceneRun:
             else:
                 description = integrator_for(method, self.loaded.kind)
                 series = series_of(self.entry, method) or records.new_series(
-                    method.spec, method.name, method.parameters, description
+                    method.spec,
+                    method.name,
+                    method.parameters,
+                    description,
+                    samplers.OURS if method.is_ours else samplers.MITSUBAS[0],
                 )
                 candidate = Candidate(method, mi.load_dict(description), series, {})
                 if self._attempt(candidate, self._calibrate) and candidate.times:
@@ -263,12 +276,29 @@ class SceneRun:
             wanted = list(candidate.times)
         self._check_samples(wanted)
         if not series["points"]:
+            self._choose_sampler(candidate, wanted)
             series["first_seconds"] = first.seconds
             series["build_seconds"] = _build_seconds(candidate)
         missing = [spp for spp in wanted if spp not in candidate.spps]
         series["points"] = sorted(
             [*series["points"], *map(records.new_point, missing)], key=lambda point: point["spp"]
         )
+
+    def _choose_sampler(self, candidate: Candidate, wanted: list[int]) -> None:
+        """Give Mitsuba's integrators the best of Mitsuba's samplers."""
+        if candidate.method.is_ours:
+            return
+
+        def render(sampler: str, spp: int, number: int) -> Drawing:
+            candidate.series["sampler"] = sampler
+            return self._draw(candidate, spp, CALIBRATION_SEED + 2 + number)
+
+        chosen = samplers.choose(self.loaded.sensors, wanted, render)
+        candidate.series["sampler"] = chosen
+        candidate.times = {
+            spp: self._draw(candidate, spp, CALIBRATION_SEED).seconds for spp in candidate.times
+        }
+        say(f"{self.entry['name']}: {candidate.method.spec} with {chosen}")
 
     def _largest(self) -> int | None:
         """Return the largest number of samples that the reference is good for, None if any."""
@@ -389,7 +419,8 @@ class SceneRun:
             return
         if max(candidate.times) > 1:
             # Compiles the kernel for numbers that are no powers of two
-            self._draw(candidate, 3, CALIBRATION_SEED)
+            few = samplers.allowed(self.loaded.sensors[candidate.sampler].sampler(), 3)
+            self._draw(candidate, few, CALIBRATION_SEED)
         spp, drawing = self._fill_time(candidate, target)
         errors = metrics.relative_errors(drawing.image, self.reference)
         series["equal_time"] = {
@@ -410,6 +441,7 @@ class SceneRun:
         times, tries = candidate.times, []
         for _ in range(EQUAL_TIME_TRIES):
             spp = calibration.samples_in(times, target)
+            spp = samplers.allowed(self.loaded.sensors[candidate.sampler].sampler(), spp)
             drawing = self._draw(candidate, spp, EQUAL_TIME_SEED)
             distance = abs(np.log(drawing.seconds / target))
             tries.append((distance, spp, drawing))

@@ -8,8 +8,7 @@ are the arguments of the generator, and ``integrator``, ``max_depth``, ``rr_dept
 emission is stored in a texture where a generator offers it, since Mitsuba's own sampling finds no
 light otherwise.
 
-All samplers become ``independent``: stratified ones round numbers of samples to their taste, and
-errors would not fall in proportion to the samples.
+Samplers are those of ``bench.samplers``, whatever a scene has.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from typing import Any
 import mitsuba as mi
 
 from manylights import lights, loading, scenes
-from manylights.bench import methods
+from manylights.bench import methods, samplers
 from manylights.errors import UsageError, one_line
 from manylights.loading import integrators
 from manylights.loading.parsing import USD_ENDINGS
@@ -51,12 +50,14 @@ class MeasuredScene:
         kind: what its integrator computes.
         lights: number of lights, triangles of emissive meshes counted one by one.
         media: does it have participating media?
+        sensors: for each sampler.
     """
 
     scene: Any
     kind: methods.Kind
     lights: int
     media: bool
+    sensors: dict[str, Any]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -142,10 +143,8 @@ def _load_file(path: str, defines: dict[str, str], stage: loading.UsdOptions) ->
         plugin, parameters = "path", {}
         for node in integrators.leaf_integrators(parsed.state):
             plugin, parameters = node.props.plugin_name(), dict(node.props.items())
-        for node in parsed.state.nodes:
-            if node.type == mi.ObjectType.Sampler:
-                node.props = mi.Properties("independent")
         media = any(node.type == mi.ObjectType.Medium for node in parsed.state.nodes)
+        samplers.add_sensors(parsed.state)
         scene = loading.instantiate(parsed)
     return _describe(path, scene, plugin, parameters, media)
 
@@ -171,7 +170,9 @@ def _generated(text: str) -> Source:
         # Methods bring their own integrators.
         description["integrator"] = {"type": "direct"}
         media = "medium" in description["sensor"]
-        return _describe(text, mi.load_dict(description), plugin, chosen, media)
+        return _describe(
+            text, mi.load_dict(samplers.with_sensors(description)), plugin, chosen, media
+        )
 
     return Source(text, _plain(text), _plain("-".join([name, *rest])), fingerprint, load)
 
@@ -230,7 +231,8 @@ def _describe(
     except UsageError as error:
         raise UsageError(f"{text}: {error}") from error
     count = sum(lights.count_kinds(scene).values())
-    return MeasuredScene(scene, kind, count, media)
+    sensors = dict(zip(samplers.NAMES, scene.sensors()))
+    return MeasuredScene(scene, kind, count, media, sensors)
 
 
 def _plain(text: str) -> str:

@@ -26,7 +26,9 @@ Renders scenes with several methods of choosing lights and measures times and er
 SCENE is an XML file, a USD stage, or a generator of manylights.scenes:
 NAME[:LIGHTS][,KEY=VALUE]..., as in city:1000,kind=points or
 rooms:1000,integrator=path,max_depth=6. Pictures of generators have 160 x 90 pixels unless
-width and height say otherwise. All samplers become "independent".
+width and height say otherwise. The scene's own
+sampler does not matter: our methods have manylights_sobol, Mitsuba's integrators the best of
+independent, multijitter, orthogonal and ldsampler.
 
 A method is NAME[:PARAMETER=VALUE]..., as in talk:splitting_rate=4:split_function=far.
 uniform and power are Mitsuba's own direct, path or volpath, which choose emitters with the

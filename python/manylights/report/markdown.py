@@ -120,9 +120,31 @@ def _comparison(data: Results) -> list[str]:
         "is better.",
         _table(heads, rows),
         about,
+        *_samplers(data),
         "Over all scenes:",
         _table(["method", "scenes", "median", "lowest", "highest"], summary),
     ]
+
+
+def _samplers(data: Results) -> list[str]:
+    """Say which samplers methods had; those of Mitsuba's integrators differ between scenes."""
+    found: dict[str, dict[str, list[str]]] = {"ours": {}, "Mitsuba's": {}}
+    for scene in data.scenes:
+        for series in scene.series:
+            owner = "Mitsuba's" if series.mitsubas else "ours"
+            if series.sampler:
+                scenes = found[owner].setdefault(series.sampler, [])
+                scenes += [] if scene.title in scenes else [scene.title]
+    lines = []
+    for owner, samplers in found.items():
+        names = [
+            f"`{name}`" + (f" ({'; '.join(scenes)})" if len(samplers) > 1 else "")
+            for name, scenes in sorted(samplers.items())
+        ]
+        lines += [f"- {owner}: {', '.join(names)}"] if names else []
+    if not lines:
+        return []
+    return ["Samplers, for Mitsuba's integrators the best of Mitsuba's:", "\n".join(lines)]
 
 
 def _measured(data: Results, method: str) -> bool:
