@@ -77,11 +77,11 @@ private:
         Vector2i pixel(Vector2u(x, y));
         if (m_film->sample_border())
             pixel -= m_film->rfilter()->border_size();
+        pixel += m_film->crop_offset(); // may be negative
         typename Sums::Samples result{ first, count, samples, {}, {} };
         std::unique_ptr<Float[]> values(new Float[m_channels]);
-        result.offset =
-            render_sample(Vector2f(pixel + m_film->crop_offset()),
-                          dr::rsqrt((ScalarFloat) pass.spp), values.get(), active);
+        result.offset = render_sample(Vector2f(pixel), dr::rsqrt((ScalarFloat) pass.spp),
+                                      values.get(), active);
         bool differentiable = false;
         for (size_t i = 0; i < m_channels; ++i) {
             differentiable |= dr::grad_enabled(values[i]);
@@ -117,8 +117,7 @@ private:
         mitsuba::ref<ImageBlock> block = m_film->create_block();
         block->set_offset(m_film->crop_offset());
         block->set_coalesce(block->coalesce() && samples.per_number >= 4);
-        block->put(Vector2f(pixel + m_film->crop_offset()) + samples.offset, values,
-                   active);
+        block->put(Vector2f(pixel) + samples.offset, values, active);
         m_film->put_block(block);
     }
 
