@@ -16,7 +16,7 @@ import pytest
 from tests import statistics_tools as tools
 
 SOURCE = Path(__file__).parents[1]
-PLUGINS = ["manylights_direct", "manylights_volpath"]
+PLUGINS = ["manylights_direct", "manylights_sobol", "manylights_volpath"]
 
 
 # ----------------------------------------------------------------- variants that were not compiled

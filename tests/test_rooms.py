@@ -81,8 +81,8 @@ def test_no_two_classes_have_one_name():
 PLUGINS = PACKAGE.parents[1] / "plugins" / "manylights"
 
 #: Folders of the C++, in the order of the data: each includes only those before it, and itself.
-FOLDERS = ("base", "table", "receiver", "learning", "tree", "choice", "scene", "direct", "paths")
-FOLDERS += ("render", "plugin")
+FOLDERS = ("base", "sampler", "table", "receiver", "learning", "tree", "choice", "scene")
+FOLDERS += ("direct", "paths", "render", "plugin")
 
 INCLUDE = re.compile(r'#include ["<]manylights/(\w+)/')
 

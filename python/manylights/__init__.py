@@ -1,7 +1,7 @@
 """Light-tree rendering of scenes with very many lights, as plugins for Mitsuba 3.
 
-Importing this package makes Mitsuba find the plugins ``manylights_direct`` and
-``manylights_volpath``::
+Importing this package makes Mitsuba find the plugins ``manylights_direct``,
+``manylights_volpath`` and ``manylights_sobol``::
 
     import mitsuba as mi
     import manylights

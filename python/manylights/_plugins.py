@@ -10,7 +10,7 @@ from pathlib import Path
 REQUIRED_MITSUBA = "3.9.1"
 
 #: What every installation has.
-PLUGINS = ("manylights_direct", "manylights_volpath")
+PLUGINS = ("manylights_direct", "manylights_volpath", "manylights_sobol")
 
 #: Names the folder to use instead of the package's: for developers, the build tree.
 OVERRIDE = "MANYLIGHTS_PLUGIN_DIR"
