@@ -92,6 +92,8 @@ public:
     using UInt32 = dr::uint32_array_t<Float>;
     using Int32  = dr::int32_array_t<Float>;
     using Mask   = dr::mask_t<Float>;
+    using Storage =
+        std::conditional_t<dr::is_jit_v<Float>, UInt32, dr::DynamicArray<UInt32>>;
 
     /// @param records  a power of two
     VisibilityTable(uint32_t records, const CellSize &size)
@@ -177,6 +179,32 @@ public:
         m_records = records;
     }
 
+    /// What was counted: for each record and child the rays that were blocked and those that
+    /// arrived
+    Storage counts() const {
+        if constexpr (dr::is_jit_v<Float>) {
+            return m_counts;
+        } else {
+            Storage result = dr::empty<Storage>(m_counts.size());
+            for (size_t i = 0; i < m_counts.size(); ++i)
+                result.data()[i] = m_counts[i].load(std::memory_order_relaxed);
+            return result;
+        }
+    }
+
+    size_t count_size() const { return (size_t) m_records * kCounts; }
+
+    /// Go on from what was counted elsewhere, in a table of the same size
+    void set_counts(const Storage &counts) {
+        if constexpr (dr::is_jit_v<Float>) {
+            m_counts = counts;
+            dr::make_opaque(m_counts);
+        } else {
+            for (size_t i = 0; i < m_counts.size(); ++i)
+                m_counts[i] = counts.data()[i];
+        }
+    }
+
     /// Is \ref count to be called?
     const Mask &counting() const { return m_counting; }
     void set_counting(bool on) { m_counting = dr::opaque<Mask>(on); }
@@ -211,8 +239,6 @@ public:
     }
 
 private:
-    using Storage =
-        std::conditional_t<dr::is_jit_v<Float>, UInt32, dr::DynamicArray<UInt32>>;
     using Counts = std::conditional_t<dr::is_jit_v<Float>, UInt32,
                                       std::vector<std::atomic<uint32_t>>>;
 

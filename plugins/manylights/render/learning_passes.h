@@ -1,14 +1,15 @@
 #pragma once
 
 /**
- * What is learnt while rendering: visibility, from the shadow rays of a first pass, at most a
- * sixteenth of the samples, and of a second one if the first promises much; more passes teach
- * little. All other samples are rendered in one pass, whose pattern is then as whole as it can
- * be; in JIT variants each pass is recorded anew.
+ * What is learnt while rendering: visibility, from the shadow rays of the training passes of a
+ * plan, which come first and count in the image. All other passes use the factors that these
+ * rays gave. The counts can be read and written, so that parts of a job share them.
  */
 
+#include "manylights/base/host_view.h"
 #include "manylights/choice/parameters.h"
 #include "manylights/scene/scene_lights.h"
+#include "pass_plan.h"
 #include "passes.h"
 #include <mitsuba/render/sensor.h>
 
@@ -16,70 +17,126 @@ namespace manylights {
 
 template <typename Float, typename Spectrum> class LearningPasses {
 public:
-    MI_IMPORT_TYPES(Scene, Sensor, Sampler)
+    MI_IMPORT_TYPES(Scene, Sensor)
     using Lights = SceneLights<Float, Spectrum>;
+    using Counts = mitsuba::DynamicBuffer<UInt32>;
 
-    /// `running`: set as long as this learns
-    LearningPasses(Lights &lights, const SamplingParameters &params, bool &running)
-        : m_lights(lights), m_params(params), m_running(running) {}
-    ~LearningPasses() {
-        if (!m_wanted)
-            return;
-        m_running = false;
-        m_lights.stop_learning(keeps());
-    }
-    LearningPasses(const LearningPasses &) = delete;
+    explicit LearningPasses(const SamplingParameters &params) : m_params(params) {}
 
-    /// Begin to learn, if that is wanted and pays off
-    void start(const Scene *scene, Sensor *sensor, uint32_t spp) {
-        if (m_params.learn_visibility == LearnVisibility::No ||
-            m_params.considers_all(m_lights.tree().light_count) ||
-            has_entry_for_each_sample(sensor))
-            return;
-        Sampler *sampler = sensor->sampler();
-        if (spp)
-            sampler->set_sample_count(spp);
-        spp             = sampler->sample_count();
-        uint32_t pixels = dr::prod(film_size(sensor->film()));
-        double total    = (double) pixels * spp;
-        m_training      = training_samples(spp, pixels);
-        if (spp < kLeastSamples || total < kLeastTotal || total > kMostTotal)
-            return;
-        m_lights.start_learning(scene, cell_size(scene, sensor), total, keeps());
-        m_running = m_wanted = true;
+    /// Ends what \ref start began, however that comes
+    class Session {
+    public:
+        explicit Session(LearningPasses &learning) : m_learning(learning) {}
+        ~Session() { m_learning.stop(); }
+        Session(const Session &) = delete;
+
+    private:
+        LearningPasses &m_learning;
+    };
+
+    void traverse(mitsuba::TraversalCallback *cb) {
+        cb->put("visibility.counts", m_counts, mitsuba::ParamFlags::NonDifferentiable);
     }
 
-    bool wanted() const { return m_wanted; }
+    /// The counts were written: all passes that follow use them
+    void set_written() {
+        m_frozen    = dr::width(m_counts) > 0;
+        m_continues = false;
+    }
 
-    /// Returns the samples per pixel of a pass, of `left` that have not been rendered
-    uint32_t start_pass(uint32_t pass, uint32_t left) {
-        if (pass > 0 && m_trains)
-            m_trains = m_lights.learn(/* go_on = */ pass < kTraining);
-        return m_trains ? std::min(m_training, left) : left;
+    /// The next rendering knows nothing of those before
+    void forget() {
+        m_counts = Counts();
+        m_frozen = m_continues = false;
+    }
+
+    bool keeps() const { return m_params.learn_visibility == LearnVisibility::Keep; }
+
+    /// Is there anything to learn?
+    bool can_learn(const Lights &lights) const {
+        return m_params.learn_visibility != LearnVisibility::No &&
+               !m_params.considers_all(lights.tree().light_count);
+    }
+
+    /// The passes of a rendering that has no plan
+    PassPlan plan(const Lights &lights, const SamplerKind &sampler, uint32_t spp,
+                  uint64_t pixels) const {
+        if (m_frozen || !can_learn(lights) || (double) pixels * spp < kLeastTotal)
+            return PassPlan::whole(spp);
+        return PassPlan::learning(spp, pixels, !sampler.independent && !sampler.indexed);
+    }
+
+    /// `job`: there is a plan, whose passes may come in several renderings
+    void start(Lights &lights, const Scene *scene, const Sensor *sensor,
+               const PassPlan &plan, double samples, bool job) {
+        m_lights = nullptr;
+        m_job    = job;
+        bool anew =
+            !plan.empty() && plan[0].starts_learning() && (job || !m_frozen);
+        if (!can_learn(lights)) {
+            if (m_frozen)
+                refuse_counts(0);
+            return;
+        }
+        if (!anew && !m_frozen && !(m_continues || keeps()))
+            return;
+        m_lights = &lights;
+        if (anew) {
+            lights.start_learning(scene, cell_size(scene, sensor), samples, keeps());
+            m_frozen = false;
+        } else if (m_frozen && !(m_continues && lights.learner().count_size() > 0)) {
+            lights.start_learning(scene, cell_size(scene, sensor), samples, false);
+            write_counts();
+        }
+        m_continues = job;
+    }
+
+    void start_pass(const PlannedPass &pass) {
+        if (m_lights)
+            m_lights->change_learner(
+                [&](auto &learner) { learner.count(pass.role == Role::Train); });
+    }
+
+    void end_pass(const PlannedPass &pass) {
+        if (m_lights && pass.role == Role::Train)
+            m_lights->change_learner([](auto &learner) { learner.learn(); });
     }
 
 private:
-    static constexpr uint32_t kTraining = 2;
-    /// The image has the noise of these samples, too: more of them cost more than they teach
-    static constexpr uint32_t kTrainingTotal = 1 << 16;
-    /// Of three, the first would be a large part, and it is the slowest
-    static constexpr uint32_t kLeastSamples = 4;
-    /// A wavefront has less than 2^32 lanes, and some may be left over
-    static constexpr double kMostTotal =
-        dr::is_jit_v<Float> ? 0x1p31 : dr::Infinity<double>;
+    void stop() {
+        if (!m_lights)
+            return;
+        if (m_job || keeps())
+            m_counts = Counts(m_lights->learner().counts());
+        m_lights->change_learner([&](auto &learner) { learner.stop(m_job || keeps()); });
+        m_lights = nullptr;
+    }
+
     /// With fewer samples, recording one more pass takes longer than it may gain
     static constexpr double kLeastTotal =
         dr::is_cuda_v<Float> ? 0x1p23 : (dr::is_llvm_v<Float> ? 0x1p19 : 0);
 
-    bool keeps() const { return m_params.learn_visibility == LearnVisibility::Keep; }
+    /// Go on from what the user has written
+    void write_counts() {
+        size_t size = m_lights->learner().count_size();
+        if (dr::width(m_counts) != size) {
+            m_lights->change_learner([](auto &learner) { learner.stop(false); });
+            m_lights = nullptr;
+            refuse_counts(size);
+        }
+        m_lights->change_learner([&](auto &learner) {
+            learner.set_counts(typename Lights::Learner::Counts(dr::detach<false>(m_counts)));
+        });
+    }
 
-    /// Per pixel: kTrainingTotal in the image if a sixteenth of all are as many, and a divisor
-    static uint32_t training_samples(uint32_t spp, uint32_t pixels) {
-        uint32_t enough  = (kTrainingTotal + pixels - 1) / pixels,
-                 samples = std::max(std::min(spp / 16, enough), 1u);
-        while (spp % samples)
-            --samples;
-        return samples;
+    [[noreturn]] void refuse_counts(size_t size) const {
+        std::string allowed =
+            size ? std::to_string(size) +
+                       " for this scene and number of samples, or none at all"
+                 : "none: nothing is to be learnt in this scene";
+        throw std::runtime_error("manylights: \"visibility.counts\" has " +
+                                 std::to_string(dr::width(m_counts)) +
+                                 " numbers, but must have " + allowed + ".");
     }
 
     static CellSize cell_size(const Scene *scene, const Sensor *sensor) {
@@ -95,31 +152,14 @@ private:
         return result;
     }
 
-    /// Does a parameter of the sensor have one entry for each sample of a rendering? All
-    /// samples are then rendered at once.
-    static bool has_entry_for_each_sample(const Sensor *sensor) {
-        struct Visitor : mitsuba::TraversalCallback {
-            size_t entries = 1;
-            void put_value(std::string_view, void *value, uint32_t,
-                           const std::type_info &type) override {
-                if (type == typeid(Float))
-                    entries = std::max(entries, dr::width(*(const Float *) value));
-            }
-            void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
-        } visitor;
-        if constexpr (dr::is_jit_v<Float>) {
-            visitor.entries = dr::width(sensor->world_transform().matrix);
-            const_cast<Sensor *>(sensor)->traverse(&visitor);
-        }
-        return visitor.entries > 1;
-    }
-
-    Lights &m_lights;
     const SamplingParameters &m_params;
-    bool &m_running;
-    bool m_wanted = false, m_trains = true;
-    /// Samples per pixel of a training pass
-    uint32_t m_training = 0;
+    /// What has been learnt, for users
+    Counts m_counts;
+    /// Were they written? Do the lights know what this job has learnt so far?
+    bool m_frozen = false, m_continues = false;
+    /// In a rendering that learns or uses what was learnt
+    Lights *m_lights = nullptr;
+    bool m_job       = false;
 };
 
 } // namespace manylights

@@ -9,6 +9,7 @@
 #include "manylights/choice/parameters.h"
 #include "manylights/scene/light_cache.h"
 #include "passes.h"
+#include "training_pixels.h"
 #include <drjit/morton.h>
 #include <drjit/packet.h>
 #include <mitsuba/core/progress.h>
@@ -30,10 +31,11 @@ public:
     using Cache  = LightCache<Float, Spectrum>;
     using Lights = typename Cache::Lights;
     using Pass   = manylights::Pass<Float, Spectrum>;
+    using Learning = LearningPasses<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
         : Base(props), m_params(params),
-          m_cache(params.splits_nodes(), params.bsdf_samples > 0) {}
+          m_cache(params.splits_nodes(), params.bsdf_samples > 0), m_learning(m_params) {}
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
                     bool evaluate) override {
@@ -41,27 +43,24 @@ public:
         dr::scoped_flush_denormals flush(true);
         auto lock = lock_learning();
         typename Cache::Rendering guard(m_cache, scene);
-        bool may_learn =
-            !m_learning && !m_differentiating && m_samples_per_pass == kOnePass;
-        LearningPasses<Float, Spectrum> learning(guard.lights(), m_params, m_learning);
-        if (may_learn)
-            learning.start(scene, sensor, spp);
-        if (learning.wanted())
-            return render_passes(learning, scene, sensor, seed, develop, evaluate);
-        return Base::render(scene, sensor, seed, spp, develop, evaluate);
+        if (m_rendering || m_differentiating || m_samples_per_pass != kOnePass ||
+            has_entry_for_each_sample(sensor))
+            return Base::render(scene, sensor, seed, spp, develop, evaluate);
+        Flag rendering(m_rendering);
+        return render_passes(guard.lights(), scene, sensor, seed, spp, develop, evaluate);
     }
 
     TensorXf render_forward(Scene *scene, void *params, Sensor *sensor, UInt32 seed,
                             uint32_t spp) override {
         auto lock = lock_learning();
-        Differentiating guard(m_differentiating);
+        Flag guard(m_differentiating);
         return Base::render_forward(scene, params, sensor, seed, spp);
     }
 
     void render_backward(Scene *scene, void *params, const TensorXf &grad_in,
                          Sensor *sensor, UInt32 seed, uint32_t spp) override {
         auto lock = lock_learning();
-        Differentiating guard(m_differentiating);
+        Flag guard(m_differentiating);
         Base::render_backward(scene, params, grad_in, sensor, seed, spp);
     }
 
@@ -72,6 +71,21 @@ public:
     void traverse(mitsuba::TraversalCallback *cb) override {
         Base::traverse(cb);
         m_cache.traverse(cb);
+        cb->put("plan", m_plan_numbers, mitsuba::ParamFlags::NonDifferentiable);
+        m_learning.traverse(cb);
+    }
+
+    void parameters_changed(const std::vector<std::string> &keys) override {
+        Base::parameters_changed(keys);
+        auto written = [&](std::string_view name) {
+            return std::any_of(keys.begin(), keys.end(), [&](std::string_view key) {
+                return key == name || key == name.substr(name.rfind('.') + 1);
+            });
+        };
+        if (keys.empty() || written("plan"))
+            set_plan();
+        if (keys.empty() || written("visibility.counts"))
+            m_learning.set_written();
     }
 
 protected:
@@ -89,37 +103,83 @@ private:
         return lock;
     }
 
-    /// Gradients are computed from one recording, without passes
-    struct Differentiating {
+    /// True for a while
+    struct Flag {
         bool &flag;
-        explicit Differentiating(bool &flag) : flag(flag) { flag = true; }
-        ~Differentiating() { flag = false; }
+        explicit Flag(bool &flag) : flag(flag) { flag = true; }
+        ~Flag() { flag = false; }
+        Flag(const Flag &) = delete;
     };
 
-    /// Mitsuba's passes are all of one size, those of \ref LearningPasses are not
-    TensorXf render_passes(LearningPasses<Float, Spectrum> &learning, Scene *scene,
-                           Sensor *sensor, const UInt32 &seed, bool develop,
+    /// Follow the plan that was written; none ends a job
+    void set_plan() {
+        HostView numbers(m_plan_numbers);
+        bool had_plan = !m_plan.empty();
+        m_plan        = PassPlan();
+        m_plan        = PassPlan::parse({ numbers.data(), numbers.data() + numbers.size() });
+        if (!m_plan.empty() || !had_plan || m_learning.keeps())
+            return;
+        m_learning.forget();
+        m_cache.forget_visibility();
+    }
+
+    /// Does a parameter of the sensor have one entry for each sample of a rendering? All
+    /// samples are then rendered at once.
+    static bool has_entry_for_each_sample(const Sensor *sensor) {
+        struct Visitor : mitsuba::TraversalCallback {
+            size_t entries = 1;
+            void put_value(std::string_view, void *value, uint32_t,
+                           const std::type_info &type) override {
+                if (type == typeid(Float))
+                    entries = std::max(entries, dr::width(*(const Float *) value));
+            }
+            void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
+        } visitor;
+        if constexpr (dr::is_jit_v<Float>) {
+            visitor.entries = dr::width(sensor->world_transform().matrix);
+            const_cast<Sensor *>(sensor)->traverse(&visitor);
+        }
+        return visitor.entries > 1;
+    }
+
+    TensorXf render_passes(Lights &lights, Scene *scene, Sensor *sensor,
+                           const UInt32 &seed, uint32_t spp, bool develop,
                            bool evaluate) {
         m_stop = false;
         m_render_timer.reset();
         Film *film       = sensor->film();
         Sampler *sampler = sensor->sampler();
         auto size        = film_size(film);
-        uint32_t spp     = sampler->sample_count();
-        Log(mitsuba::Info, "Starting render job (%ux%u, %u samples, learning visibility)",
-            size.x(), size.y(), spp);
+        if (spp)
+            sampler->set_sample_count(spp);
+        spp = sampler->sample_count();
 
+        SamplerKind kind(sampler);
+        bool job        = !m_plan.empty();
+        uint64_t pixels = (uint64_t) size.x() * size.y();
+        PassPlan plan   = job ? m_plan : m_learning.plan(lights, kind, spp, pixels);
+        plan.check(spp);
         size_t channels = film->prepare(aov_names());
-        uint32_t done   = 0;
-        for (uint32_t number = 0; done < spp && !should_stop(); ++number) {
-            uint32_t samples = learning.start_pass(number, spp - done);
-            Pass pass(seed, number, done, samples, sampler);
+        Log(mitsuba::Info, "Starting render job (%ux%u, %u sample%s%s)", size.x(),
+            size.y(), spp, spp == 1 ? "" : "s",
+            plan.size() > 1 ? tfm::format(", %u passes", plan.size()) : "");
+
+        typename Learning::Session session(m_learning);
+        m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
+        for (size_t i = 0; i < plan.size() && !should_stop(); ++i) {
+            m_learning.start_pass(plan[i]);
+            Pass pass(plan[i], seed, spp, job, sampler);
+            bool last = i + 1 == plan.size();
             if constexpr (dr::is_jit_v<Float>)
-                render_wavefront(scene, sensor, channels, pass);
+                render_wavefront(scene, sensor, channels, pass, last);
             else
                 render_blocks(scene, sensor, channels, pass, spp);
-            done += samples;
+            m_learning.end_pass(plan[i]);
         }
+        return finish(film, develop, evaluate);
+    }
+
+    TensorXf finish(Film *film, bool develop, bool evaluate) {
         TensorXf result;
         if (develop) {
             result = film->develop();
@@ -152,7 +212,11 @@ private:
 
     void render_blocks(Scene *scene, Sensor *sensor, size_t channels, const Pass &pass,
                        uint32_t spp) {
-        Film *film    = sensor->film();
+        Film *film = sensor->film();
+        SampleCount<Float, Spectrum> guard(sensor->sampler());
+        sensor->sampler()->set_sample_count(pass.sampler_count);
+        if (pass.sampler.indexed)
+            set_first_sample<Float, Spectrum>(sensor->sampler(), pass.first);
         auto size     = film_size(film);
         uint32_t side = block_side(size);
         mitsuba::Spiral spiral(size, film->crop_offset(), side);
@@ -178,8 +242,8 @@ private:
                     film->put_block(block);
                     std::lock_guard<std::mutex> lock(mutex);
                     if (++done; progress)
-                        progress->update(((float) pass.first +
-                                          (float) pass.samples * done / (float) count) /
+                        progress->update(((float) pass.plan.first +
+                                          (float) pass.plan.count * done / (float) count) /
                                          (float) spp);
                 }
             });
@@ -198,6 +262,7 @@ private:
                        uint32_t side) const {
         const Film *film = sensor->film();
         auto size        = film_size(film);
+        TrainingPixels<UInt32> training(size.x(), size.y(), pass.plan_seed);
         block->clear();
         for (uint32_t i = 0; i < side * side && !should_stop(); ++i) {
             auto at = dr::morton_decode<mitsuba::Point<uint32_t, 2>>(i);
@@ -207,9 +272,13 @@ private:
                     pixel = place - Point2i(film->crop_offset());
             if (film->sample_border())
                 pixel += film->rfilter()->border_size();
+            if (pass.plan.role != Role::All &&
+                training.contains(pixel.x(), pixel.y()) != (pass.plan.role == Role::Train))
+                continue;
             sampler->seed(pass.seed * dr::prod(size) + pixel.y() * size.x() + pixel.x());
-            skip(sampler, pass);
-            for (uint32_t j = 0; j < pass.samples && !should_stop(); ++j) {
+            if (!pass.sampler.indexed)
+                skip(sampler, pass);
+            for (uint32_t j = 0; j < pass.plan.count && !should_stop(); ++j) {
                 render_sample(scene, sensor, sampler, block, aovs, Vector2f(place),
                               dr::rsqrt((ScalarFloat) spp), true);
                 sampler->advance();
@@ -220,42 +289,72 @@ private:
     // --------------------------------------------------------------------------- JIT variants
 
     void render_wavefront(Scene *scene, Sensor *sensor, size_t channels,
-                          const Pass &pass) {
+                          const Pass &pass, bool last) {
         Film *film       = sensor->film();
         Sampler *sampler = sensor->sampler();
         auto size        = film_size(film);
-        uint32_t spp     = sampler->sample_count();
-        auto lanes       = wavefront(pass, spp);
-
-        // Passes differ in these numbers: opaque, so that they have one kernel
-        UInt32 index    = dr::arange<UInt32>(lanes.size(dr::prod(size)));
-        auto [block, i] = divide(index, lanes.block);
-        auto [local, j] = divide(i, lanes.samples);
-        UInt32 pixel    = dr::fmadd(block, dr::opaque<UInt32>(lanes.pixels), local);
-        uint32_t masked = pass.sampler.independent ? 0 : pass.first;
-        Mask active     = local < dr::opaque<UInt32>(lanes.pixels) &&
-                          pixel < dr::prod(size) && j >= dr::opaque<UInt32>(masked);
+        TrainingPixels<UInt32> training(size.x(), size.y(), pass.plan_seed);
+        bool trains    = pass.plan.role == Role::Train;
+        uint32_t count = trains ? training.columns * training.rows : dr::prod(size);
 
         SampleCount<Float, Spectrum> guard(sampler);
-        if (pass.sampler.independent)
-            sampler->set_sample_count(lanes.samples);
-        sampler->set_samples_per_wavefront(lanes.samples);
-        // A pattern depends on the number of a pixel's first lane: to be that of all samples
-        UInt32 seed = pass.seed;
-        if (pass.sampler.pattern && lanes.samples < spp)
-            seed += pixel * (spp - lanes.samples);
-        sampler->seed(seed, lanes.size(dr::prod(size)));
+        sampler->set_sample_count(pass.sampler_count);
+        auto lanes = wavefront(pass, sampler->sample_count());
+
+        // Passes differ in these numbers: opaque, so that they have one kernel
+        UInt32 index    = dr::arange<UInt32>(lanes.size(count));
+        auto [block, i] = divide(index, lanes.block);
+        auto [local, j] = divide(i, lanes.samples);
+        UInt32 number   = dr::fmadd(block, dr::opaque<UInt32>(lanes.pixels), local);
+        Mask active     = local < dr::opaque<UInt32>(lanes.pixels) && number < count &&
+                      j >= dr::opaque<UInt32>(pass.first) &&
+                      j < dr::opaque<UInt32>(pass.first + pass.plan.count);
+        UInt32 x, y;
+        std::tie(y, x) = divide(number, trains ? training.columns : size.x());
+        if (trains) {
+            std::tie(x, y) = training.in_block(x, y);
+            active &= x < size.x() && y < size.y();
+        } else if (pass.plan.role == Role::Rest) {
+            active &= !training.contains(x, y);
+        }
+        UInt32 pixel = dr::fmadd(y, size.x(), x);
+
+        seed(sampler, pass, lanes, pixel, number, j, lanes.size(count), dr::prod(size));
 
         // One for each pass: sums do not depend on which thread got which part
         mitsuba::ref<ImageBlock> image = film->create_block();
         image->set_offset(film->crop_offset());
         std::unique_ptr<Float[]> aovs(new Float[channels]);
+        Vector2i position(Vector2u(x, y));
+        if (film->sample_border())
+            position -= film->rfilter()->border_size();
         render_sample(scene, sensor, sampler, image, aovs.get(),
-                      position(film, size, pixel), dr::rsqrt((ScalarFloat) spp), active);
-        if (pass.first + pass.samples <
-            spp) // the last pass waits as any other rendering does
+                      Vector2f(position + film->crop_offset()),
+                      dr::rsqrt((ScalarFloat) pass.spp), active);
+        if (!last) // the last pass waits as any other rendering does
             dr::eval(image->tensor());
         film->put_block(image);
+    }
+
+    /// Each pixel gets the numbers that belong to it, whatever the lanes
+    static void seed(Sampler *sampler, const Pass &pass, const Wavefront &lanes,
+                     const UInt32 &pixel, const UInt32 &number, const UInt32 &sample,
+                     uint32_t size, uint32_t pixels) {
+        if (pass.sampler.indexed) {
+            set_first_sample(sampler, UInt32(sample + dr::opaque<UInt32>(pass.first)));
+            sampler->set_samples_per_wavefront(1);
+            UInt32 first_key = pass.seed * pixels;
+            dr::make_opaque(first_key);
+            sampler->seed(first_key + pixel, size);
+            return;
+        }
+        sampler->set_samples_per_wavefront(lanes.samples);
+        UInt32 seed = pass.seed;
+        // A pattern depends on the number of a pixel's first lane: to be that of all samples
+        if (pass.sampler.pattern &&
+            (lanes.samples < pass.sampler_count || pass.plan.role == Role::Train))
+            seed += pixel * pass.sampler_count - number * lanes.samples;
+        sampler->seed(seed, size);
     }
 
     /// Quotient and remainder: exact, and faster than a division of integers
@@ -265,20 +364,14 @@ private:
         return { quotient, dr::fnmadd(quotient, dr::opaque<UInt32>(divisor), x) };
     }
 
-    /// Of a pixel on the film
-    static Vector2f position(const Film *film, const mitsuba::Vector<uint32_t, 2> &size,
-                             const UInt32 &pixel) {
-        UInt32 y = pixel / size.x();
-        Vector2i result(Vector2u(dr::fnmadd(y, size.x(), pixel), y));
-        if (film->sample_border())
-            result -= film->rfilter()->border_size();
-        return Vector2f(result + film->crop_offset());
-    }
-
     static constexpr const char *ClassName = "LightIntegrator"; // for log messages
 
     std::recursive_mutex m_mutex;
-    bool m_learning = false, m_differentiating = false;
+    bool m_rendering = false, m_differentiating = false;
+    /// What users have written, four numbers for each pass, and what it says
+    mitsuba::DynamicBuffer<UInt32> m_plan_numbers;
+    PassPlan m_plan;
+    Learning m_learning;
 };
 
 } // namespace manylights

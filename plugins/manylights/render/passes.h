@@ -5,6 +5,7 @@
  * told so that all of them together are those of one rendering.
  */
 
+#include "pass_plan.h"
 #include <drjit/jit.h>
 #include <mitsuba/core/math.h>
 #include <mitsuba/core/random.h>
@@ -31,41 +32,85 @@ struct SamplerKind {
     bool independent;
     /// All of a pixel's samples form a pattern, which depends on the seed
     bool pattern;
+    /// A pixel's samples can be asked for by their numbers
+    bool indexed;
 
     template <typename Sampler> explicit SamplerKind(const Sampler *sampler) {
         std::string_view name = sampler->class_name();
         independent           = name == "IndependentSampler";
         pattern = name == "StratifiedSampler" || name == "MultijitterSampler" ||
                   name == "OrthogonalSampler" || name == "LowDiscrepancySampler";
+        indexed = name == "SobolSampler";
     }
 };
 
-/// Some of each pixel's samples, from number `first` on
+/// Some of the samples of some pixels
 template <typename Float, typename Spectrum> struct Pass {
     using UInt32  = dr::uint32_array_t<Float>;
     using Sampler = mitsuba::Sampler<Float, Spectrum>;
 
-    uint32_t first, samples;
-    UInt32 seed;
+    PlannedPass plan;
     SamplerKind sampler;
+    /// Samples per pixel of the rendering, and those that the sampler is told of
+    uint32_t spp, sampler_count;
+    /// Number of the pass's first sample among the latter
+    uint32_t first;
+    UInt32 seed;
+    /// Of the rendering: which pixels train
+    UInt32 plan_seed;
 
-    /// The first pass has the seed of the rendering, and so have all that share a pattern
-    Pass(const UInt32 &rendering, uint32_t number, uint32_t first, uint32_t samples,
+    /**
+     * Passes of samplers with numbers have one seed, and those of a pattern if they share it.
+     * @param job  a plan is followed, whose passes have patterns of their own
+     */
+    Pass(const PlannedPass &plan, const UInt32 &rendering, uint32_t spp, bool job,
          const Sampler *sampler)
-        : first(first), samples(samples), seed(rendering), sampler(sampler) {
-        if (number > 0 && !this->sampler.pattern)
-            seed = mitsuba::sample_tea_32(rendering, UInt32(number)).first;
+        : plan(plan), sampler(sampler), spp(spp), sampler_count(spp), first(plan.first),
+          seed(rendering), plan_seed(rendering) {
+        if (plan.scramble > 0)
+            seed = mitsuba::sample_tea_32(seed, UInt32(plan.scramble)).first;
+        if (this->sampler.indexed || (this->sampler.pattern && !job))
+            return;
+        if (plan.first > 0 || plan.role == Role::Rest) {
+            uint32_t number = plan.first | (plan.role == Role::Rest ? 1u << 31 : 0u);
+            seed            = mitsuba::sample_tea_32(seed, UInt32(number), 5).first;
+        }
+        if (job || this->sampler.independent) {
+            sampler_count = plan.count;
+            first         = 0;
+        }
     }
 };
+
+/// A sampler with numbers begins with this one of each pixel; may be one for each lane
+template <typename Float, typename Spectrum>
+void set_first_sample(mitsuba::Sampler<Float, Spectrum> *sampler,
+                      const dr::uint32_array_t<Float> &first) {
+    using UInt32 = dr::uint32_array_t<Float>;
+    struct Writer : mitsuba::TraversalCallback {
+        UInt32 first;
+        void put_value(std::string_view name, void *value, uint32_t,
+                       const std::type_info &type) override {
+            if (name == "first_sample" && type == typeid(UInt32))
+                *(UInt32 *) value = first;
+        }
+        void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
+    } writer;
+    writer.first = first;
+    sampler->traverse(&writer);
+}
 
 /// The number of samples that a sampler had is its own again at the end, however that comes
 template <typename Float, typename Spectrum> class SampleCount {
     using Sampler = mitsuba::Sampler<Float, Spectrum>;
+    using UInt32  = dr::uint32_array_t<Float>;
 
 public:
     explicit SampleCount(Sampler *sampler)
         : m_sampler(sampler), m_count(sampler->sample_count()) {}
     ~SampleCount() {
+        if (SamplerKind(m_sampler).indexed)
+            set_first_sample<Float, Spectrum>(m_sampler, dr::opaque<UInt32>(0));
         m_sampler->set_sample_count(m_count);
         if constexpr (dr::is_jit_v<Float>)
             m_sampler->set_samples_per_wavefront(m_count);
@@ -100,22 +145,23 @@ struct Wavefront {
 };
 
 /**
- * Of the independent sampler, any number of samples. No pixel is split between threads, or
+ * Of samplers that have any samples, those of the pass. No pixel is split between threads, or
  * warps that are not full, whose sums would depend on which of them came first, unless more
  * than an eighth of the lanes would be left over. Of others, all up to the last one of the pass,
  * if their number divides the whole, or else all samples; those before the pass are masked.
  */
 template <typename Float, typename Spectrum>
-Wavefront wavefront(const Pass<Float, Spectrum> &pass, uint32_t spp) {
-    uint32_t block = dr::is_cuda_v<Float> ? 32 : jit_llvm_block_size();
-    block          = std::max(block, mitsuba::math::round_to_power_of_two(pass.samples));
-    uint32_t lanes = pass.samples;
-    if (pass.sampler.independent && block % lanes <= block / 8)
-        return { block, block / lanes, lanes };
-    if (!pass.sampler.independent) {
+Wavefront wavefront(const Pass<Float, Spectrum> &pass, uint32_t sampler_count) {
+    uint32_t lanes = pass.plan.count;
+    if (!pass.sampler.independent && !pass.sampler.indexed) {
         lanes += pass.first;
-        lanes = spp % lanes == 0 ? lanes : spp;
+        lanes = sampler_count % lanes == 0 ? lanes : sampler_count;
+        return { lanes, 1, lanes };
     }
+    uint32_t block = dr::is_cuda_v<Float> ? 32 : jit_llvm_block_size();
+    block          = std::max(block, mitsuba::math::round_to_power_of_two(lanes));
+    if (block % lanes <= block / 8)
+        return { block, block / lanes, lanes };
     return { lanes, 1, lanes };
 }
 

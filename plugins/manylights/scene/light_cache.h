@@ -102,6 +102,14 @@ public:
         return Use(vouched_or_updated(scene)->lights);
     }
 
+    /// Forget what was learnt of the visibility of all lights
+    void forget_visibility() {
+        std::lock_guard<std::mutex> guard(m_mutex);
+        for (const EntryPtr &entry : m_entries)
+            if (entry)
+                entry->lights->change_learner([](auto &l) { l.stop(/* keep = */ false); });
+    }
+
     /// Expose the size of the current tree, read-only
     void traverse(mitsuba::TraversalCallback *cb) {
         auto read_only = mitsuba::ParamFlags::ReadOnly;

@@ -111,21 +111,15 @@ public:
 
     const Tree &tree() const { return m_tree; }
 
-    /// See \ref VisibilityLearner for these three
+    using Learner = VisibilityLearner<Float, Spectrum>;
+    /// What is learnt of the lights' visibility; after a change kernels use what it says
+    const Learner &learner() const { return m_learner; }
     void start_learning(const Scene *scene, const CellSize &size, double samples,
                         bool keep) {
         m_learner.start(scene, size, m_statistics.nodes, samples, keep);
-        m_tree.visibility = m_learner.in_use();
     }
-
-    bool learn(bool go_on) {
-        bool goes_on      = m_learner.learn(go_on);
-        m_tree.visibility = m_learner.in_use();
-        return goes_on;
-    }
-
-    void stop_learning(bool keep) {
-        m_learner.stop(keep);
+    template <typename Change> void change_learner(const Change &change) {
+        change(m_learner);
         m_tree.visibility = m_learner.in_use();
     }
 
@@ -265,7 +259,7 @@ private:
     }
 
     Tree m_tree;
-    VisibilityLearner<Float, Spectrum> m_learner;
+    Learner m_learner;
     IndexStorage m_light_of_primitive, m_shape_lights;
     std::unordered_map<const Shape *, ShapeLights<Shape>> m_shape_map;
     /// See HostTable; for each emitter of the scene

@@ -14,9 +14,10 @@ namespace manylights {
 
 template <typename Float, typename Spectrum> class VisibilityLearner {
 public:
-    using Scene = mitsuba::Scene<Float, Spectrum>;
-    using Shape = mitsuba::Shape<Float, Spectrum>;
-    using Table = VisibilityTable<dr::detached_t<Float>>;
+    using Scene  = mitsuba::Scene<Float, Spectrum>;
+    using Shape  = mitsuba::Shape<Float, Spectrum>;
+    using Table  = VisibilityTable<dr::detached_t<Float>>;
+    using Counts = typename Table::Storage;
 
     /**
      * Learn from now on: anew, or in addition to what was kept if the shapes are still the same.
@@ -35,30 +36,38 @@ public:
         if (keep && m_table && shapes.same_places(m_shapes)) {
             m_table->prepare(records, size);
         } else {
-            m_table  = std::make_unique<Table>(records, size);
-            m_shapes = std::move(shapes);
+            m_table    = std::make_unique<Table>(records, size);
+            m_shapes   = std::move(shapes);
+            m_worth_it = false;
             m_shapes.hold();
         }
-        m_table->set_counting(true);
-        m_used = true;
     }
 
-    /// Use what was learnt so far, if it is worth it, and learn on if that is wanted and worth
-    /// it, too. Returns whether it does.
-    bool learn(bool go_on) {
-        float gain = m_table->learn();
-        if (gain < kLeastGain)
-            m_used = false;
-        go_on = go_on && gain > kLargeGain;
-        m_table->set_counting(go_on);
-        return go_on;
+    /// Count the rays that follow, or use what was learnt so far, if that is worth it
+    void count(bool on) {
+        if (!m_table)
+            return;
+        m_table->set_counting(on);
+        m_used = on || m_worth_it;
+    }
+
+    /// Make factors of the counts
+    void learn() { m_worth_it = m_table->learn() >= kLeastGain; }
+
+    /// What was counted, empty if there is no table
+    Counts counts() const { return m_table ? m_table->counts() : Counts(); }
+    /// How many numbers they are
+    size_t count_size() const { return m_table ? m_table->count_size() : 0; }
+    void set_counts(const Counts &counts) {
+        m_table->set_counts(counts);
+        learn();
     }
 
     void stop(bool keep) {
-        m_table->set_counting(false);
+        count(false);
         if (keep)
             return;
-        m_used = false;
+        m_used = m_worth_it = false;
         m_table.reset();
     }
 
@@ -71,7 +80,7 @@ private:
     std::unique_ptr<Table> m_table;
     /// The shapes where it was learnt
     Fingerprint<Float> m_shapes{ 0 };
-    bool m_used = false;
+    bool m_used = false, m_worth_it = false;
 };
 
 } // namespace manylights
