@@ -69,10 +69,9 @@ public:
     /// `job`: there is a plan, whose passes may come in several renderings
     void start(Lights &lights, const Scene *scene, const Sensor *sensor,
                const PassPlan &plan, double samples, bool job) {
-        m_lights = nullptr;
-        m_job    = job;
-        bool anew =
-            !plan.empty() && plan[0].starts_learning() && (job || !m_frozen);
+        m_lights  = nullptr;
+        m_job     = job;
+        bool anew = !plan.empty() && plan[0].starts_learning() && (job || !m_frozen);
         if (!can_learn(lights)) {
             if (m_frozen)
                 refuse_counts(0);
@@ -125,7 +124,8 @@ private:
             refuse_counts(size);
         }
         m_lights->change_learner([&](auto &learner) {
-            learner.set_counts(typename Lights::Learner::Counts(dr::detach<false>(m_counts)));
+            learner.set_counts(
+                typename Lights::Learner::Counts(dr::detach<false>(m_counts)));
         });
     }
 

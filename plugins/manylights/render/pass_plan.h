@@ -85,11 +85,12 @@ public:
     void check(uint32_t spp) const {
         for (size_t i = 0; i < m_passes.size(); ++i)
             if ((uint64_t) m_passes[i].first + m_passes[i].count > spp)
-                fail("pass " + std::to_string(i) + " has the samples " +
-                     std::to_string(m_passes[i].first) + " to " +
-                     std::to_string((uint64_t) m_passes[i].first + m_passes[i].count - 1) +
-                     ", but there are " + std::to_string(spp) +
-                     " per pixel: 0 to " + std::to_string(spp - 1));
+                fail(
+                    "pass " + std::to_string(i) + " has the samples " +
+                    std::to_string(m_passes[i].first) + " to " +
+                    std::to_string((uint64_t) m_passes[i].first + m_passes[i].count - 1) +
+                    ", but there are " + std::to_string(spp) + " per pixel: 0 to " +
+                    std::to_string(spp - 1));
     }
 
     bool empty() const { return m_passes.empty(); }

@@ -5,7 +5,7 @@
  * told so that all of them together are those of one rendering.
  */
 
-#include "pass_plan.h"
+#include "pixel_set.h"
 #include <drjit/jit.h>
 #include <mitsuba/core/math.h>
 #include <mitsuba/core/random.h>
@@ -80,6 +80,11 @@ template <typename Float, typename Spectrum> struct Pass {
             first         = 0;
         }
     }
+
+    /// Of the rendering, when a part of this pass is done
+    float progress(float part) const {
+        return ((float) plan.first + (float) plan.count * part) / (float) spp;
+    }
 };
 
 /// A sampler with numbers begins with this one of each pixel; may be one for each lane
@@ -131,38 +136,6 @@ void skip(mitsuba::Sampler<Float, Spectrum> *sampler, const Pass<Float, Spectrum
         sampler->next_1d(true);
     for (uint32_t i = 0; i < pass.first; ++i)
         sampler->advance();
-}
-
-/// How samples lie in a wavefront: blocks of lanes hold whole pixels, and some lanes may be
-/// left over
-struct Wavefront {
-    /// Lanes of a block, pixels therein, and lanes of each pixel
-    uint32_t block, pixels, samples;
-
-    uint32_t size(uint32_t pixel_count) const {
-        return (pixel_count + pixels - 1) / pixels * block;
-    }
-};
-
-/**
- * Of samplers that have any samples, those of the pass. No pixel is split between threads, or
- * warps that are not full, whose sums would depend on which of them came first, unless more
- * than an eighth of the lanes would be left over. Of others, all up to the last one of the pass,
- * if their number divides the whole, or else all samples; those before the pass are masked.
- */
-template <typename Float, typename Spectrum>
-Wavefront wavefront(const Pass<Float, Spectrum> &pass, uint32_t sampler_count) {
-    uint32_t lanes = pass.plan.count;
-    if (!pass.sampler.independent && !pass.sampler.indexed) {
-        lanes += pass.first;
-        lanes = sampler_count % lanes == 0 ? lanes : sampler_count;
-        return { lanes, 1, lanes };
-    }
-    uint32_t block = dr::is_cuda_v<Float> ? 32 : jit_llvm_block_size();
-    block          = std::max(block, mitsuba::math::round_to_power_of_two(lanes));
-    if (block % lanes <= block / 8)
-        return { block, block / lanes, lanes };
-    return { lanes, 1, lanes };
 }
 
 } // namespace manylights
