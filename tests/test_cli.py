@@ -165,7 +165,7 @@ def test_direct_is_replaced_with_its_parameters(scene, tmp_path):
 
 def test_keep_leaves_direct(scene, tmp_path):
     log = render(scene, tmp_path / "out.exr", "--integrator", "keep").stderr
-    assert "replaced" not in log
+    assert "direct replaced" not in log
 
 
 def test_integrator_by_name(scene, tmp_path):

@@ -173,7 +173,7 @@ def test_noise_is_that_of_many_seeds(few_pilots, name):
 def test_noise_of_parts_of_one_sequence_is_too_high(few_pilots):
     """Why independent sequences are needed, and what the test above would find."""
     scene = loaded("points")
-    images, _ = images_and_noises(scene, 32, range(16))
+    images = tools.render_seeds(scene.scene, spp=32)
     truth = noise.noise(images.mean(axis=0), images.var(axis=0, ddof=1))
     job = Job.of(scene, spp=32)
     parts = [
@@ -209,7 +209,7 @@ def test_noise_asked_for_is_reached(few_pilots, name, asked):
 def test_mean_of_renders_until_a_noise_has_no_bias(few_pilots):
     """How many samples there are depends on them; a bias of two percent would be found."""
     scene = loaded("points", 16, 10, filter_type="box")
-    results = [manylights.render(scene, seed=s, until_noise=0.1) for s in range(100, 132)]
+    results = [manylights.render(scene, seed=s, until_noise=0.02) for s in range(100, 132)]
     assert len({result.samples for result in results}) > 1
     images = np.stack([result.image for result in results])
     reference = tools.render_seeds(scene.scene, spp=256, seeds=range(8))
