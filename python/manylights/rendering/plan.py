@@ -41,7 +41,7 @@ LEAST_STEPS = 4
 
 #: One of so many pixels trains, and so many samples of all of them together are enough: the image
 #: has their noise, too.
-TRAINED_PIXELS, TRAINING_SAMPLES = 16, 2**16
+TRAINED_PIXELS, TRAINING_SAMPLES = 16, 2**17
 
 #: Number of independent sequences from which the variance of the image is found, if it is asked
 #: for. More of them would stratify less.
@@ -133,7 +133,7 @@ def steps(spp: int, limits: Limits) -> Iterator[Step]:
     >>> [step.spp for step in steps(300, limits)]
     [128, 128, 44]
     >>> [(one.first, one.count, one.role) for one in next(steps(300, limits)).passes]
-    [(0, 5, 1), (0, 5, 2), (5, 123, 0)]
+    [(0, 5, 1), (5, 5, 1), (0, 10, 2), (10, 118, 0)]
     """
     index = 0
     while (step := step_at(index, spp, limits)) is not None:
@@ -163,9 +163,10 @@ def passes(first: int, count: int, limits: Limits) -> list[Pass]:
         return [Pass(first if limits.indexed else 0, count)]
     trained = max(limits.pixels // TRAINED_PIXELS, 1)
     training = min(-(-TRAINING_SAMPLES // trained), count)
-    while not limits.indexed and count % training:
-        training += 1
-    result = [Pass(0, training, TRAIN), Pass(0, training, OTHERS)]
+    # The second half has the noise of what the first has taught.
+    half = training // 2
+    result = [Pass(0, half, TRAIN)] if half else []
+    result += [Pass(half, training - half, TRAIN), Pass(0, training, OTHERS)]
     return result + ([Pass(training, count - training)] if count > training else [])
 
 
