@@ -69,6 +69,11 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
      should arrive by what is known of their visibility, all of it where nothing is known, 0
      where shadow rays are traced to all lights. (Default: no, i.e. |false|)
 
+ * - plan, visibility.counts
+   - |int| array
+   - Passes of a job and what it has learnt, see below.
+   - |exposed|
+
  * - lights, lights_in_tree, nodes, depth
    - |int|
    - Size of the light tree that was built last.
@@ -118,18 +123,26 @@ lights there are. **It works less well**
 - for very few lights, or lights of equal importance, where Mitsuba's :monosp:`direct` does
   the same with less arithmetic.
 
-**Learning visibility.** A first pass has :math:`2^{16}` samples, rounded up to some of each pixel,
-but at most a sixteenth of all (or one of each pixel). For each cell of space and each node of the
-tree its shadow rays are counted: those that were traced to lights below each of its children, and
-the share :math:`v` of them that arrived. Later samples weight :math:`h`, :math:`H` and :math:`g` by
-:math:`\max(\sqrt{v}, 0.1)`. If much is hidden, the rays of a second pass of this size are counted
-as well; if nothing is, the rest is rendered as usual. All samples count in
-the image, which stays unbiased, and the same seed gives the same bits. The table takes at most 38
-MB. Nothing is learnt from fewer than four samples per pixel, from images with fewer than
-:math:`2^{19}` samples in LLVM variants or :math:`2^{23}` in CUDA variants, where another pass costs
-more than it gains, where all lights are considered anyway, and while differentiating; an
-integrator that is nested in others which only ask it for samples uses what it has kept, and learns
-nothing. What was kept is dropped with the integrator: load another one to start anew.
+**Learning visibility.** Some of the pixels, one at a random place in each block of 4 x 4, are
+rendered first: their first samples, :math:`2^{17}` in all if there are as many. For each cell of
+space and each node of the tree their shadow rays are counted: those that were traced to lights
+below each of its children, and the share :math:`v` of them that arrived. All other samples weight
+:math:`h`, :math:`H` and :math:`g` by :math:`\sqrt{v}`, or by a floor that falls from 0.1 to 0.02
+with the number of rays; if nothing is hidden, they are rendered as usual. All samples count in the
+image, which stays unbiased, and the same seed gives the same bits. The table takes at most 38 MB.
+Nothing is learnt from images with fewer than :math:`2^{19}` samples in LLVM variants or
+:math:`2^{23}` in CUDA variants, where another pass costs more than it gains, where all lights are
+considered anyway, and while differentiating; an integrator that is nested in others which only ask
+it for samples uses what it has kept, and learns nothing. What was kept is dropped with the
+integrator: load another one to start anew.
+
+**Parts of a job.** A rendering that is not made by one call follows a plan, the entry
+:code:`plan` of :code:`mi.traverse(integrator)`: four numbers for each pass, its first sample, the
+number of samples of each pixel, its role (0: all pixels; 1: those that train; 2: the others) and a
+scramble (0, or another number for other random numbers). :code:`visibility.counts` is what the
+training passes have taught; written to another integrator, it renders the same bits. Passes of the
+sampler :monosp:`manylights_sobol` are parts of one sequence for each pixel; of other samplers, each
+has a pattern of its own. An empty plan ends the job.
 
 Emitters of all kinds are supported. Point and spot lights and area lights on meshes, spheres,
 disks and cylinders are evaluated without virtual function calls, so that kernels do not grow

@@ -65,6 +65,11 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
      :code:`expected` as :monosp:`manylights_direct`, summed over the vertices.
      (Default: no, i.e. |false|)
 
+ * - plan, visibility.counts
+   - |int| array
+   - Passes of a job and what it has learnt, see :monosp:`manylights_direct`.
+   - |exposed|
+
  * - lights, lights_in_tree, nodes, depth
    - |int|
    - Size of the light tree that was built last.

@@ -16,15 +16,14 @@ pytestmark = pytest.mark.usefixtures("plugin")
 VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
 METHODS = ["resampled_tree", "talk", "adaptive_splitting"]
 
-# A power of two: the samples of a pixel then stay together when LLVM variants split the work, and
-# the order in which they are added does not depend on the number of threads.
 SAMPLES = 16
 
 
-def larger_scene():
+def larger_scene(rfilter="box", sampler="independent"):
     """The mixed scene with enough pixels for both threads to get work."""
     scene = light_scenes.SCENES["mixed"]()
-    scene["sensor"]["film"] |= {"width": 96, "height": 64}
+    scene["sensor"]["film"] |= {"width": 96, "height": 64, "rfilter": {"type": rfilter}}
+    scene["sensor"]["sampler"] = {"type": sampler, "sample_count": SAMPLES}
     return mi.load_dict(scene)
 
 
@@ -63,6 +62,31 @@ def test_image_does_not_depend_on_threads(variant, method, thread_count):
     assert np.array_equal(one, two)
     assert np.array_equal(two, rendered(method))
     assert not np.array_equal(two, rendered(method, seed=8))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("name", ["manylights_direct", "manylights_volpath"])
+@pytest.mark.parametrize(
+    ("rfilter", "sampler", "samples"),
+    [
+        ("gaussian", "independent", 16),
+        ("mitchell", "independent", 7),
+        ("gaussian", "multijitter", 12),
+        ("box", "manylights_sobol", 100),
+    ],
+)
+def test_filters_do_not_depend_on_threads(variant, name, rfilter, sampler, samples, thread_count):
+    """Pixels share samples where a filter is wide; no number of samples divides the work evenly."""
+
+    def image():
+        method = mi.load_dict({"type": name})
+        return np.array(mi.render(larger_scene(rfilter, sampler), integrator=method, spp=samples))
+
+    thread_count(1)
+    one = image()
+    for threads in (2, 5):
+        thread_count(threads)
+        assert np.array_equal(one, image())
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)

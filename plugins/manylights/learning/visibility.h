@@ -8,7 +8,7 @@
  * v of rays that arrive, the weights of children in the tree, H and the targets of stage 3
  * get the factor
  *
- *     f = max(sqrt(v), .1).
+ *     f = max(sqrt(v), floor),    floor = .8 / sqrt(n), but .02 to .1, after n rays.
  *
  * The root is due to the visibility V being 0 or 1: the best density is sqrt(E[(F V)^2]) =
  * F sqrt(v). A factor is fixed before the number that it steers is drawn, so the image is
@@ -27,23 +27,17 @@
 
 namespace manylights {
 
-/// Smallest factor: bounds what a wrong record can do
-constexpr float kLeastVisibility = .1f;
+/// Smallest factor: bounds what a wrong record can do, and falls with the number of its rays
+constexpr float kFloorOfFew = .1f, kFloorOfMany = .02f, kFloorFall = .8f;
 
-/**
- * Cells are cubes with a side of .3 times the distance from the camera, rounded down to a
- * power of two. At .15, .3 and .6 times, a house of 108 rooms with 10,000 lights had 1.46, 1.25
- * and 1.25 of relative variance (6.6 without learning), with 1,000 lights .191, .189, .195 (.87).
- */
+/// Cells are cubes with a side of so much of the distance from the camera, rounded down to a
+/// power of two
 constexpr float kCellGrowth = .3f;
 /// Limits of the side, in parts of the scene's diagonal
 constexpr float kLeastCell = 1e-4f, kLargestCell = .125f;
 
-/**
- * Receivers are moved by up to half a cell before they are looked up. With 0, 1/4, 1/2 and a
- * whole one, that house had relative variances of .188, .196, .202, .217 and (10,000 lights)
- * .464, .532, .538, .564; but with 1/4 and less the noise changes visibly at borders.
- */
+/// Receivers are moved by up to half a cell before they are looked up: with less, noise
+/// changes visibly at borders
 constexpr float kJitter = .5f;
 
 /// What the size of cells depends on: the camera's position and the scene's diagonal
@@ -51,15 +45,11 @@ struct CellSize {
     float camera[3], scene;
 };
 
-/**
- * The least gain (\ref VisibilityTable::learn) for which it is worth looking visibility up.
- * After the first sixteenth of 64 samples it was .41 behind a wall, .21 in that house, .05 in a
- * city, .03 in rooms that are lit by their own lamps, .013 under an open canopy, where looking
- * up took 26 % of time for nothing, and 0 in an open field.
- */
+/// The least gain (\ref VisibilityTable::learn) for which it is worth looking visibility up
 constexpr float kLeastGain = .02f;
-/// The gain above which it is worth to learn from one more pass
-constexpr float kLargeGain = .1f;
+
+/// Rays that a child is assumed to have had, and to have been seen by as its siblings are
+constexpr float kPriorRays = .5f;
 
 /// What is known of a node's children
 template <typename Float> struct ChildVisibility {
@@ -273,7 +263,7 @@ private:
         Float rays, gain;
     };
 
-    /// At first one ray that arrives is assumed, and a child to be like its siblings
+    /// At first one ray that arrives is assumed
     template <typename Read> static Summary summarize(const Read &read) {
         Float arrived = (read(1) + read(3)) + (read(5) + read(7)),
               rays    = arrived + (read(0) + read(2)) + (read(4) + read(6)),
@@ -281,10 +271,12 @@ private:
         UInt32 word(0);
         for (uint32_t c = 0; c < 4; ++c) {
             Float hits = read(2 * c + 1), n = hits + read(2 * c),
-                  v = (hits + all) / (n + 1.f), root = dr::sqrt(v);
+                  v    = dr::fmadd(all, kPriorRays, hits) / (n + kPriorRays),
+                  root = dr::sqrt(v);
             sum_v += n * v;
             sum_root += n * root;
-            Float f = dr::maximum(root, kLeastVisibility);
+            Float f = dr::maximum(
+                root, dr::clip(kFloorFall * dr::rsqrt(n), kFloorOfMany, kFloorOfFew));
             word |= UInt32(dr::fmadd(f, 255.f, .5f)) << (8u * c);
         }
         auto known = rays > 0.f;

@@ -7,6 +7,7 @@
  */
 
 #include "pixel_set.h"
+#include <drjit/util.h>
 #include <drjit/while_loop.h>
 #include <mitsuba/render/film.h>
 #include <mitsuba/render/imageblock.h>
@@ -50,9 +51,10 @@ public:
         mitsuba::ref<ImageBlock> block = m_film->create_block(
             { width, end - begin }, /* normalize = */ false, /* border = */ false);
         block->set_offset(m_film->crop_offset() + mitsuba::Vector<uint32_t, 2>(0, begin));
-        uint32_t channels = block->channel_count();
-        for (uint32_t i = 0; i < channels; ++i)
-            dr::scatter(block->tensor().array(), sums.entry(i), pixel * channels + i);
+        // All channels at once, so that there is one kernel
+        dr::scatter_reduce_packet_dynamic(ReduceOp::Add, samples.channels.size(),
+                                          block->tensor().array(), sums.data(), pixel,
+                                          Mask(true), ReduceMode::NoConflicts);
         m_film->put_block(block);
     }
 

@@ -63,7 +63,7 @@ public:
                   uint64_t pixels) const {
         if (m_frozen || !can_learn(lights) || (double) pixels * spp < kLeastTotal)
             return PassPlan::whole(spp);
-        return PassPlan::learning(spp, pixels, !sampler.independent && !sampler.indexed);
+        return PassPlan::learning(spp, pixels, !sampler.divides());
     }
 
     /// `job`: there is a plan, whose passes may come in several renderings

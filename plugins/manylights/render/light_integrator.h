@@ -20,7 +20,7 @@ template <typename Float, typename Spectrum,
 class LightIntegrator : public BaseIntegrator<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(BaseIntegrator, m_block_size, m_samples_per_pass, m_stop,
-                   m_render_timer, should_stop, render_sample)
+                   m_render_timer, m_timeout, should_stop, render_sample)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Film, ImageBlock)
     using Cache    = LightCache<Float, Spectrum>;
     using Lights   = typename Cache::Lights;
@@ -35,7 +35,7 @@ public:
                     bool evaluate) override {
         // Mitsuba's threads do, the main thread does not: bits would depend on who renders what
         dr::scoped_flush_denormals flush(true);
-        auto lock = lock_learning();
+        auto lock = lock_rendering();
         typename Cache::Rendering guard(m_cache, scene);
         if (m_rendering || m_differentiating || m_samples_per_pass != kOnePass ||
             has_entry_for_each_sample(sensor))
@@ -46,14 +46,14 @@ public:
 
     TensorXf render_forward(Scene *scene, void *params, Sensor *sensor, UInt32 seed,
                             uint32_t spp) override {
-        auto lock = lock_learning();
+        auto lock = lock_rendering();
         Flag guard(m_differentiating);
         return Base::render_forward(scene, params, sensor, seed, spp);
     }
 
     void render_backward(Scene *scene, void *params, const TensorXf &grad_in,
                          Sensor *sensor, UInt32 seed, uint32_t spp) override {
-        auto lock = lock_learning();
+        auto lock = lock_rendering();
         Flag guard(m_differentiating);
         Base::render_backward(scene, params, grad_in, sensor, seed, spp);
     }
@@ -92,12 +92,9 @@ private:
                                         OrderedBlocks<Float, Spectrum, LightIntegrator>>;
     static constexpr uint32_t kOnePass = (uint32_t) -1; // Mitsuba's default
 
-    /// One integrator learns from one rendering at a time: others that overlap wait for it
-    std::unique_lock<std::recursive_mutex> lock_learning() {
-        std::unique_lock<std::recursive_mutex> lock(m_mutex, std::defer_lock);
-        if (m_params.learn_visibility != LearnVisibility::No)
-            lock.lock();
-        return lock;
+    /// One integrator has one rendering at a time: others that overlap wait for it
+    std::unique_lock<std::recursive_mutex> lock_rendering() {
+        return std::unique_lock<std::recursive_mutex>(m_mutex);
     }
 
     /// True for a while
@@ -157,10 +154,7 @@ private:
         PassPlan plan   = job ? m_plan : m_learning.plan(lights, kind, spp, pixels);
         plan.check(spp);
         size_t channels = film->prepare(aov_names());
-        Log(mitsuba::Info, "Starting render job (%ux%u, %u sample%s%s)", size.x(),
-            size.y(), spp, spp == 1 ? "" : "s",
-            plan.size() > 1 ? tfm::format(", %u passes", plan.size()) : "");
-
+        log_start(size, spp, plan.size());
         typename Learning::Session session(m_learning);
         m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
         Renderer renderer(*this, scene, sensor, channels, m_block_size);
@@ -170,7 +164,24 @@ private:
             renderer.render(pass);
             m_learning.end_pass(plan[i]);
         }
+        if constexpr (dr::is_jit_v<Float>)
+            Log(mitsuba::Info, "Computation graph recorded and compiled. (took %s)",
+                mitsuba::util::time_string((float) m_render_timer.value(), true));
         return finish(film, develop, evaluate);
+    }
+
+    void log_start(const mitsuba::Vector<uint32_t, 2> &size, uint32_t spp,
+                   size_t passes) const {
+        std::string details =
+            passes > 1 ? tfm::format(", %zu passes", passes) : std::string();
+        if constexpr (!dr::is_jit_v<Float>) {
+            size_t threads = pool_size() + 1;
+            details += tfm::format(", %zu thread%s", threads, threads == 1 ? "" : "s");
+        }
+        Log(mitsuba::Info, "Starting render job (%ux%u, %u sample%s%s)", size.x(),
+            size.y(), spp, spp == 1 ? "" : "s", details);
+        if (m_timeout > 0.f)
+            Log(mitsuba::Info, "Timeout specified: %.2f seconds.", m_timeout);
     }
 
     TensorXf finish(Film *film, bool develop, bool evaluate) {

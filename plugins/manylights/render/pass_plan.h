@@ -63,8 +63,8 @@ public:
     }
 
     /**
-     * The first samples of some pixels train, those of the others and then all other samples
-     * follow.
+     * The first samples of some pixels train: one half of them, then the other, which already
+     * uses what the first has taught. Those of the other pixels and all other samples follow.
      * @param divides  the number of training samples has to divide the whole (their pattern)
      */
     static PassPlan learning(uint32_t spp, uint64_t pixels, bool divides) {
@@ -74,7 +74,10 @@ public:
         while (divides && spp % samples)
             ++samples;
         PassPlan result;
-        result.m_passes.push_back({ 0, samples, Role::Train, 0 });
+        uint32_t half = samples / 2;
+        if (half > 0)
+            result.m_passes.push_back({ 0, half, Role::Train, 0 });
+        result.m_passes.push_back({ half, samples - half, Role::Train, 0 });
         result.m_passes.push_back({ 0, samples, Role::Rest, 0 });
         if (samples < spp)
             result.m_passes.push_back({ samples, spp - samples, Role::All, 0 });
@@ -103,7 +106,7 @@ private:
     /// One of 4 x 4 pixels trains
     static constexpr uint32_t kTrainedPixels = 16;
     /// The image has the noise of these samples, too: more of them cost more than they teach
-    static constexpr uint64_t kTrainingTotal = 1 << 16;
+    static constexpr uint64_t kTrainingTotal = 1 << 17;
 
     [[noreturn]] static void fail(const std::string &what) {
         throw std::runtime_error("manylights: \"plan\": " + what + ".");

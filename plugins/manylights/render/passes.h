@@ -35,6 +35,9 @@ struct SamplerKind {
     /// A pixel's samples can be asked for by their numbers
     bool indexed;
 
+    /// Can some of the samples be drawn without the others?
+    bool divides() const { return independent || indexed; }
+
     template <typename Sampler> explicit SamplerKind(const Sampler *sampler) {
         std::string_view name = sampler->class_name();
         independent           = name == "IndependentSampler";
@@ -79,6 +82,19 @@ template <typename Float, typename Spectrum> struct Pass {
             sampler_count = plan.count;
             first         = 0;
         }
+    }
+
+    /// Some of the samples, of a sampler that can divide them
+    Pass piece(uint32_t begin, uint32_t count) const {
+        Pass result       = *this;
+        result.plan.count = count;
+        if (sampler.indexed)
+            result.first += begin;
+        else if (sampler.independent)
+            result.sampler_count = count;
+        if (begin > 0 && !sampler.indexed)
+            result.seed = mitsuba::sample_tea_32(seed, UInt32(begin), 7).first;
+        return result;
     }
 
     /// Of the rendering, when a part of this pass is done

@@ -4,26 +4,13 @@
  * Which pixels a pass has. One of each block of 4 x 4 trains, wherever a hash puts it.
  */
 
+#include "manylights/base/divide.h"
 #include "pass_plan.h"
-#include <drjit/jit.h>
 #include <mitsuba/core/random.h>
-#include <utility>
 
 namespace manylights {
 
 namespace dr = drjit;
-
-/// Quotient and remainder of small numbers: exact, and faster than a division of integers
-template <typename UInt32>
-std::pair<UInt32, UInt32> divide(const UInt32 &x, uint32_t divisor) {
-    if constexpr (!dr::is_jit_v<UInt32>) {
-        return { x / divisor, x % divisor };
-    } else {
-        using Double    = dr::float64_array_t<UInt32>;
-        UInt32 quotient = UInt32((Double(x) + .5) * dr::opaque<Double>(1. / divisor));
-        return { quotient, dr::fnmadd(quotient, dr::opaque<UInt32>(divisor), x) };
-    }
-}
 
 /// Coordinates count from the film's first pixel
 template <typename UInt32> class PixelSet {

@@ -29,6 +29,14 @@ public:
 
     void render(const Pass &pass) {
         SampleCount<Float, Spectrum> guard(m_sampler);
+        // No pixel has more samples at once than a part, if the sampler lets us choose
+        uint32_t most = pass.sampler.divides() ? most_lanes() : pass.plan.count;
+        for (uint32_t done = 0; done < pass.plan.count; done += most)
+            render_samples(pass.piece(done, std::min(most, pass.plan.count - done)));
+    }
+
+private:
+    void render_samples(const Pass &pass) {
         m_sampler->set_sample_count(pass.sampler_count);
         uint32_t samples = samples_per_pixel(pass);
         Pixels pixels(m_size.x(), m_size.y(), pass.plan.role, pass.plan_seed);
@@ -41,7 +49,6 @@ public:
                         samples);
     }
 
-private:
     /// The samples of a part take at most so much memory
     static constexpr uint32_t kPartBytes = 1u << 30;
 
@@ -56,7 +63,7 @@ private:
     /// Of samplers that have any samples, those of the pass. Of others, all up to the last one
     /// of the pass, if their number divides the whole, or else all samples.
     uint32_t samples_per_pixel(const Pass &pass) const {
-        if (pass.sampler.independent || pass.sampler.indexed)
+        if (pass.sampler.divides())
             return pass.plan.count;
         uint32_t total = m_sampler->sample_count(), result = pass.first + pass.plan.count;
         return total % result == 0 ? result : total;
@@ -77,11 +84,11 @@ private:
         Vector2i pixel(Vector2u(x, y));
         if (m_film->sample_border())
             pixel -= m_film->rfilter()->border_size();
+        pixel += m_film->crop_offset(); // may be negative
         typename Sums::Samples result{ first, count, samples, {}, {} };
         std::unique_ptr<Float[]> values(new Float[m_channels]);
-        result.offset =
-            render_sample(Vector2f(pixel + m_film->crop_offset()),
-                          dr::rsqrt((ScalarFloat) pass.spp), values.get(), active);
+        result.offset = render_sample(Vector2f(pixel), dr::rsqrt((ScalarFloat) pass.spp),
+                                      values.get(), active);
         bool differentiable = false;
         for (size_t i = 0; i < m_channels; ++i) {
             differentiable |= dr::grad_enabled(values[i]);
@@ -117,8 +124,7 @@ private:
         mitsuba::ref<ImageBlock> block = m_film->create_block();
         block->set_offset(m_film->crop_offset());
         block->set_coalesce(block->coalesce() && samples.per_number >= 4);
-        block->put(Vector2f(pixel + m_film->crop_offset()) + samples.offset, values,
-                   active);
+        block->put(Vector2f(pixel) + samples.offset, values, active);
         m_film->put_block(block);
     }
 

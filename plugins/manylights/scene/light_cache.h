@@ -107,7 +107,8 @@ public:
         std::lock_guard<std::mutex> guard(m_mutex);
         for (const EntryPtr &entry : m_entries)
             if (entry)
-                entry->lights->change_learner([](auto &l) { l.stop(/* keep = */ false); });
+                entry->lights->change_learner(
+                    [](auto &l) { l.stop(/* keep = */ false); });
     }
 
     /// Expose the size of the current tree, read-only
