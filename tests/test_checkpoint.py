@@ -16,8 +16,9 @@ from manylights import cli, loading
 from manylights.errors import UsageError
 from manylights.output import images
 from manylights.progress import Estimate
-from manylights.rendering import Job, checkpoint, passes, plan
-from manylights.rendering.sums import Sums
+from manylights.rendering import Job, checkpoint, plan
+from manylights.rendering.driver import Driver
+from manylights.rendering.state import State
 
 from tests.conftest import heed_ctrl_c, require_variant
 
@@ -43,13 +44,13 @@ WIDE = (
     )
 )
 
-#: A render in many short passes.
+#: A render in many short steps.
 CHILD = """
 import sys
 from manylights import cli
 from manylights.rendering import plan
-plan.SINGLE_PASS_SAMPLES = 0
-plan.MAX_SAMPLES_PER_PASS = plan.MAX_SAMPLES_PER_SCALAR_PASS = 2**15
+plan.SINGLE_STEP_SAMPLES = 0
+plan.MOST_SAMPLES = dict.fromkeys(plan.MOST_SAMPLES, 2**15)
 {before}
 sys.exit(cli.main(sys.argv[1:]))
 """
@@ -106,11 +107,10 @@ def names(folder):
 
 
 @pytest.fixture
-def short_passes(monkeypatch):
-    """Also small images are rendered in many passes."""
-    monkeypatch.setattr(plan, "SINGLE_PASS_SAMPLES", 0)
-    for name in ("MAX_SAMPLES_PER_PASS", "MAX_SAMPLES_PER_SCALAR_PASS"):
-        monkeypatch.setattr(plan, name, 2**11)
+def short_steps(monkeypatch):
+    """Also small images are rendered in many steps."""
+    monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
+    monkeypatch.setattr(plan, "MOST_SAMPLES", dict.fromkeys(plan.MOST_SAMPLES, 2**11))
 
 
 @pytest.fixture
@@ -122,10 +122,10 @@ def wide(tmp_path):
 
 
 @pytest.fixture
-def run(short_passes, wide, tmp_path, capsys):
+def run(short_steps, wide, tmp_path, capsys):
     """A function that renders in this process and returns the exit status and the log.
 
-    It writes a checkpoint after each pass.
+    It writes a checkpoint after each step.
     """
 
     def render(*arguments, variant="scalar_rgb", out="out.exr", scene=wide):
@@ -138,18 +138,18 @@ def run(short_passes, wide, tmp_path, capsys):
 
 @pytest.fixture
 def interrupt(monkeypatch, run):
-    """A function that renders with `run` until some passes are done, 3 by default of 5."""
+    """A function that renders with `run` until some steps are done, 3 by default of 5."""
 
     def render(*arguments, done=3, **options):
-        render_pass = passes.render_pass
+        render_step = Driver.render
 
-        def render_first(job, part, report):
-            if part.index == done:
+        def render_first(driver, step, seed, spp, report):
+            if step.index == done:
                 raise RuntimeError("interrupted by the test")
-            return render_pass(job, part, report)
+            return render_step(driver, step, seed, spp, report)
 
         with monkeypatch.context() as patch:
-            patch.setattr(passes, "render_pass", render_first)
+            patch.setattr(Driver, "render", render_first)
             status, log = run(*arguments, **options)
         assert status == 2 and "interrupted by the test" in log
         return log
@@ -238,19 +238,13 @@ def test_wide_filters_and_further_channels_go_on_to_the_same_bits(
     assert {"R", "G", "B", "depth.T", "normal.X", "normal.Y", "normal.Z"} <= fields
 
 
-def test_image_with_checkpoints_is_that_without_in_jit_variants(run, wide, tmp_path, llvm):
-    assert run("--spp", 27, variant=llvm)[0] == 0
-    plain = ["render", wide, "-o", tmp_path / "plain.exr", "--spp", 27, "--variant", llvm]
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_image_with_checkpoints_is_that_without(run, wide, tmp_path, variant):
+    variant = require_variant(variant)
+    assert run("--spp", 27, variant=variant)[0] == 0
+    plain = ["render", wide, "-o", tmp_path / "plain.exr", "--spp", 27, "--variant", variant]
     assert cli.main(list(map(str, [*plain, "--threads", 1]))) == 0
     assert pixels(tmp_path / "out.exr") == pixels(tmp_path / "plain.exr")
-
-
-def test_short_renders_in_scalar_variants_are_the_same_with_checkpoints(wide, tmp_path):
-    """They are one pass."""
-    for name, more in (("plain", []), ("kept", ["--checkpoint", "1"])):
-        command = ["render", wide, "-o", tmp_path / f"{name}.exr", "--variant", "scalar_rgb"]
-        assert cli.main(list(map(str, [*command, "--spp", 8, "--threads", 1, *more]))) == 0
-    assert pixels(tmp_path / "plain.exr") == pixels(tmp_path / "kept.exr")
 
 
 def test_checkpoint_is_a_picture_that_says_what_it_is(interrupt, tmp_path):
@@ -266,7 +260,8 @@ def test_checkpoint_is_a_picture_that_says_what_it_is(interrupt, tmp_path):
     start = "manylights."
     facts = {key: value for key, value in bitmap.metadata().items() if key.startswith(start)}
     facts = {key[len(start) :]: json.loads(value) for key, value in facts.items()}
-    assert facts["samples_done"] == 24 and facts["spp"] == 36 and facts["passes"] == 3
+    assert facts["samples_done"] == 24 and facts["spp"] == 36 and facts["sequences"] == 1
+    assert (facts["history"]["steps"], facts["history"]["samples"]) == (3, [24])
     assert facts["seed"] == 4294967295 and facts["variant"] == "scalar_rgb"
     assert facts["size"] == "20 x 12" and facts["define"] == {"spp": "4"}
     assert list(facts["files"]) == ["scene.xml"]
@@ -413,23 +408,23 @@ def test_checkpoint_that_cannot_be_written_does_not_stop_the_render(run, monkeyp
     assert (tmp_path / "out.exr").exists()
 
 
-def test_checkpoints_are_written_when_it_is_time(wide, short_passes, monkeypatch, tmp_path):
+def test_checkpoints_are_written_when_it_is_time(wide, short_steps, monkeypatch, tmp_path):
     """After the pass that goes past it, counted from the end of the last writing."""
     mi.set_variant("scalar_rgb")
-    loaded = loading.load(str(wide))
-    job = Job.of(loaded, 0, 36, 0, keeps_state=True)
+    job = Job.of(loading.load(str(wide)), 0, 36)
+    state = State.empty(1)
     now, written = [0.0], []
 
-    def write_slowly(self):
-        written.append(self.sums.passes)
+    def write_slowly(self, state):
+        written.append(state.history.steps)
         now[0] += 3.0
 
     monkeypatch.setattr(checkpoint.Checkpoint, "_write", write_slowly)
     kept = checkpoint.Checkpoint(tmp_path / "c.exr", job, 10.0, clock=lambda: now[0])
-    for done, time_of_pass in enumerate((9.0, 0.5, 1.0, 9.5, 0.6, 30.0), 1):
-        now[0] += time_of_pass
-        kept.sums.passes = done
-        kept.keep()
+    for time_of_step in (9.0, 0.5, 1.0, 9.5, 0.6, 30.0):
+        now[0] += time_of_step
+        state.history.steps += 1
+        kept.keep(state)
     assert written == [3, 5, 6]
 
 
@@ -451,58 +446,11 @@ def test_bar_starts_at_the_fraction_that_is_done():
     assert estimate.seconds_left() == pytest.approx(40.0)
 
 
-def test_sums_of_many_passes_are_exact_to_48_bits():
-    generator = np.random.default_rng(3)
-    sums, exact = Sums(), np.zeros((4, 5, 2), np.longdouble)
-    for _ in range(2000):
-        # From 1e-4 to 1e4: what is bright rounds what is dark away in single precision.
-        raw = (10 ** generator.uniform(-4, 4, exact.shape)).astype(np.float32)
-        sums.add(raw)
-        exact += raw
-    assert sums.passes == 2000 and sums.high.dtype == sums.low.dtype == np.float32
-    total = sums.high.astype(np.float64) + sums.low
-    np.testing.assert_allclose(total, exact.astype(np.float64), rtol=2000 * 2.0**-48)
-
-
-def test_infinite_and_undefined_channels_stay_so():
-    sums = Sums()
-    for values in ([1.0, np.inf, 1.0, 3e38], [1.0, 2.0, np.nan, 3e38], [1.0, 2.0, 1.0, 3e38]):
-        sums.add(np.array([[values]], np.float32))
-    np.testing.assert_array_equal(sums.high, [[[3.0, np.inf, np.nan, np.inf]]])
-
-
-@pytest.mark.parametrize(
-    ("variant", "width", "height", "size"),
-    [
-        ("scalar_rgb", 640, 360, 16),
-        ("scalar_rgb", 1920, 1080, 4),
-        ("scalar_rgb", 3840, 2160, 4),
-        ("llvm_ad_rgb", 640, 360, 64),
-        ("llvm_ad_rgb", 3840, 2160, 2),
-    ],
-)
-def test_passes_are_short_and_stratify(variant, width, height, size):
-    """Four million samples, or four per pixel; in JIT variants what the memory bounds."""
-    variant = require_variant(variant)
-    sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": width, "height": height}}
-    scene = mi.load_dict({"type": "scene", "sensor": sensor})
-    job = Job.of(loading.LoadedScene(scene, 1, []), spp=1000, keeps_state=True)
-    assert job.plan.samples_per_pass == size and job.plan.spp == 1000
-
-
-@pytest.mark.parametrize("pixels", [1024 * 1024, 1024 * 768, 1920 * 1080])
-def test_no_pass_repeats_another_in_scalar_variants(pixels):
-    """Mitsuba multiplies the seed by the number of pixels, in 32 bits."""
-    for seed in range(5):
-        seeds = {plan.pass_seed(seed, index) * pixels % 2**32 for index in range(4096)}
-        assert len(seeds) == 4096
-
-
 def test_tracers_of_particles_are_as_bright_in_passes(run, monkeypatch, tmp_path, llvm):
     """They divide by the samples of a pass themselves."""
     means = []
-    for name, single in (("passes", 0), ("whole", 2**20)):
-        monkeypatch.setattr(plan, "SINGLE_PASS_SAMPLES", single)
+    for name, single in (("steps", 0), ("whole", 2**20)):
+        monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", single)
         out = f"{name}.exr"
         arguments = ("--integrator", "ptracer", "--spp", 256, "-D", "resx=24", "-D", "resy=16")
         assert run(*arguments, variant=llvm, out=out, scene=SCENES / "points.xml")[0] == 0

@@ -67,7 +67,8 @@ def test_a_stage_goes_the_same_way_as_xml(usd, scalar):
     assert options == {**vars(loading.UsdOptions()), "camera": "/Camera"}
     assert loaded.notes[0] == Stage.notes[0].text
     assert "path replaced by manylights_volpath" in loaded.notes[1]
-    assert loaded.notes[2] == "emitters: 3 meshes merged into 1"
+    assert "replaced by manylights_sobol" in loaded.notes[2]
+    assert loaded.notes[3] == "emitters: 3 meshes merged into 1"
     assert loaded.files == [usd.path]
     image = np.array(loaded.scene.integrator().render(loaded.scene, spp=4))
     assert np.isfinite(image).all() and image.mean() > 0.0

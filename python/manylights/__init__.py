@@ -12,10 +12,11 @@ Importing this package makes Mitsuba find the plugins ``manylights_direct``,
 The order of ``import manylights`` and ``mi.set_variant`` does not matter: Mitsuba has one search
 path for the whole process and reads it whenever a scene asks for a plugin.
 
-``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.scenes`` generates
-scenes; ``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose emitters by
-power, for comparisons. ``manylights.merge_emitters(description)`` makes scenes with thousands of
-separate lamps start in seconds. ``manylights.usd.load(path)`` reads USD stages, with ``usd-core``.
+``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.render`` has all that the
+command ``manylights render`` has; ``manylights.scenes`` generates scenes;
+``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose emitters by power, for
+comparisons. ``manylights.merge_emitters(description)`` makes scenes with thousands of separate
+lamps start in seconds. ``manylights.usd.load(path)`` reads USD stages, with ``usd-core``.
 
 What is where, each using only those before it:
 
@@ -24,7 +25,7 @@ What is where, each using only those before it:
 - ``scenes``: generators of scenes;
 - ``loading``: from a file to Mitsuba's scene, with our integrator; ``usd``: the reader of USD;
 - ``power``, ``lights``: power of emitters; numbers about the lights of a scene and their tree;
-- ``rendering``: a job in passes, with checkpoints;
+- ``rendering``: a job in steps, with targets and checkpoints;
 - ``bench``, ``report``: measures methods, and makes pages of what was measured;
 - ``cli``: the command ``manylights``, a file for each of its commands.
 """
@@ -41,15 +42,19 @@ register()
 from manylights import scenes  # noqa: E402
 from manylights.loading.merging import merge_emitters  # noqa: E402
 from manylights.power import power_sampling, power_weights  # noqa: E402
+from manylights.rendering import Progress, RenderResult, render  # noqa: E402
 
 __version__ = "0.1.0"
 __all__ = [
     "REQUIRED_MITSUBA",
+    "Progress",
+    "RenderResult",
     "__version__",
     "merge_emitters",
     "plugin_dir",
     "power_sampling",
     "power_weights",
+    "render",
     "scenes",
 ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 
-class UsageError(Exception):
+class UsageError(ValueError):
     """The user asked for something impossible; the text says what is allowed instead."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import tempfile
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -37,6 +38,10 @@ def check_output(path: str, kind: str = "", ending: str = "") -> Path:
         raise UsageError(f"-o {path}: not writable ({error.strerror})") from error
 
 
+#: Held while a file is written; who ends the process takes it first.
+writing = threading.RLock()
+
+
 @contextmanager
 def written_whole(target: Path):
     """Context that yields another name to write to; at the end the file gets its own name.
@@ -46,16 +51,17 @@ def written_whole(target: Path):
     Raises:
         UsageError: the system does not write; the text has its reason.
     """
-    remove_leftovers(target)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        yield partial
-        _flush(partial)
-        os.replace(partial, target)
-    except OSError as error:
-        raise UsageError(f"{target}: not written ({error.strerror})") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with writing:
+        remove_leftovers(target)
+        partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+        try:
+            yield partial
+            _flush(partial)
+            os.replace(partial, target)
+        except OSError as error:
+            raise UsageError(f"{target}: not written ({error.strerror})") from error
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def remove_leftovers(target: Path) -> None:

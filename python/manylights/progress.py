@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from manylights import files
+
 #: Seconds between two looks at the state of the work.
 REFRESH = 0.1
 
@@ -18,6 +20,9 @@ PATIENCE = 1.0
 
 #: Exit status of a command that Ctrl-C ended, as shells have it: 128 + SIGINT.
 INTERRUPTED = 130
+
+#: What such a command says if it leaves nothing.
+NOTHING_WRITTEN = "interrupted, nothing written"
 
 
 class Estimate:
@@ -104,47 +109,66 @@ def _show_waiting(title: str, done: threading.Event) -> None:
         done.wait()
 
 
+class Bar:
+    """What the work of ``run_with_bar`` tells about itself, from any thread.
+
+    Attributes:
+        text: shown beside the bar.
+    """
+
+    def __init__(self) -> None:
+        self.estimate, self.text = Estimate(), ""
+
+    def begin(self, fraction: float) -> None:
+        """Begin with a fraction, from 0 to 1, that was finished before, by an earlier process."""
+        self.estimate = Estimate(begin=fraction)
+
+    def report(self, fraction: float) -> None:
+        """Take note that ``fraction`` of the work, from 0 to 1, is done now."""
+        self.estimate.report(fraction)
+
+
 def run_with_bar(
     title: str,
-    work: Callable[[Callable[[float], None]], Any],
-    writing: threading.RLock | None = None,
-    farewell: Callable[[], str] = lambda: "interrupted, nothing written",
-    begin: float = 0.0,
+    work: Callable[[Bar], Any],
+    farewell: Callable[[], str] = lambda: NOTHING_WRITTEN,
 ) -> Any:
-    """Run ``work(report)`` with a progress bar on stderr and return its result.
+    """Run ``work(bar)`` with a progress bar on stderr and return its result.
 
     The work runs in a thread of its own: a compiled renderer cannot be interrupted, but the thread
     that waits for it can. On Ctrl-C the process ends with status 130, without waiting for the work
-    and so without anything that would come after it. Without a terminal there is no bar.
+    and so without anything that would come after it; only a file that is being written is written
+    to its end. Without a terminal there is no bar.
 
     Args:
         title: what the bar is labelled with.
-        work: is given the function that takes the finished fraction, from 0 to 1.
-        writing: held by the work while it writes a file: Ctrl-C waits for it. Default: no lock.
+        work: is given the bar, to tell how far it is.
         farewell: returns what to print after Ctrl-C.
-        begin: the fraction that was finished before, from 0 to 1.
     """
-    estimate = Estimate(begin=begin)
+    bar = Bar()
     outcome: dict[str, Any] = {}
 
     def run() -> None:
         try:
-            outcome["result"] = work(estimate.report)
+            outcome["result"] = work(bar)
         except BaseException as error:
             outcome["error"] = error
 
     worker = threading.Thread(target=run, name="manylights-render", daemon=True)
     worker.start()
     try:
-        _show(title, estimate, worker)
+        _show(title, bar, worker)
     except KeyboardInterrupt:
-        _end_interrupted(writing, farewell)
+        # Never released: nothing is written any more.
+        files.writing.acquire()
+        say(farewell())
+        os._exit(INTERRUPTED)
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]
 
 
-def _show(title: str, estimate: Estimate, worker: threading.Thread) -> None:
+def _show(title: str, state: Bar, worker: threading.Thread) -> None:
     # Commands without a bar start without it.
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
@@ -154,19 +178,12 @@ def _show(title: str, estimate: Estimate, worker: threading.Thread) -> None:
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn(),
-        TextColumn("{task.fields[left]} left"),
+        TextColumn("{task.fields[left]} left {task.fields[text]}"),
     )
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=1.0, left=format_seconds(None))
+        task = bar.add_task(title, total=1.0, left=format_seconds(None), text="")
         while worker.is_alive():
             worker.join(REFRESH)
-            left = format_seconds(estimate.seconds_left())
-            bar.update(task, completed=estimate.fraction(), left=left)
+            left = format_seconds(state.estimate.seconds_left())
+            bar.update(task, completed=state.estimate.fraction(), left=left, text=state.text)
         bar.update(task, completed=1.0, left=format_seconds(0.0))
-
-
-def _end_interrupted(writing: threading.RLock | None, farewell: Callable[[], str]) -> None:
-    if writing is not None:
-        writing.acquire()
-    say(farewell())
-    os._exit(INTERRUPTED)

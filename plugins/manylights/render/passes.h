@@ -105,20 +105,21 @@ template <typename Float, typename Spectrum> struct Pass {
 
 /// A sampler with numbers begins with this one of each pixel; may be one for each lane
 template <typename Float, typename Spectrum>
-void set_first_sample(mitsuba::Sampler<Float, Spectrum> *sampler,
-                      const dr::uint32_array_t<Float> &first) {
+dr::uint32_array_t<Float> set_first_sample(mitsuba::Sampler<Float, Spectrum> *sampler,
+                                           const dr::uint32_array_t<Float> &first) {
     using UInt32 = dr::uint32_array_t<Float>;
     struct Writer : mitsuba::TraversalCallback {
         UInt32 first;
         void put_value(std::string_view name, void *value, uint32_t,
                        const std::type_info &type) override {
             if (name == "first_sample" && type == typeid(UInt32))
-                *(UInt32 *) value = first;
+                std::swap(*(UInt32 *) value, first);
         }
         void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
     } writer;
     writer.first = first;
     sampler->traverse(&writer);
+    return writer.first;
 }
 
 /// The number of samples that a sampler had is its own again at the end, however that comes
@@ -128,10 +129,13 @@ template <typename Float, typename Spectrum> class SampleCount {
 
 public:
     explicit SampleCount(Sampler *sampler)
-        : m_sampler(sampler), m_count(sampler->sample_count()) {}
+        : m_sampler(sampler), m_count(sampler->sample_count()) {
+        if (SamplerKind(m_sampler).indexed)
+            m_first = set_first_sample<Float, Spectrum>(m_sampler, dr::opaque<UInt32>(0));
+    }
     ~SampleCount() {
         if (SamplerKind(m_sampler).indexed)
-            set_first_sample<Float, Spectrum>(m_sampler, dr::opaque<UInt32>(0));
+            set_first_sample<Float, Spectrum>(m_sampler, m_first);
         m_sampler->set_sample_count(m_count);
         if constexpr (dr::is_jit_v<Float>)
             m_sampler->set_samples_per_wavefront(m_count);
@@ -141,6 +145,7 @@ public:
 private:
     Sampler *m_sampler;
     uint32_t m_count;
+    UInt32 m_first = 0;
 };
 
 /// Go to the first sample of a pass. The random numbers within strata begin where those of

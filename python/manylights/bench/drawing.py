@@ -65,15 +65,15 @@ def draw_channels(
 def _render(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -> np.ndarray:
     """Render in as many passes as the memory needs; each sample has the same weight."""
     width, height = loaded.size
-    plan = plans.whole(spp, seed)
-    many = spp * width * height > plans.MAX_SAMPLES_PER_PASS
-    if many and not mi.variant().startswith("scalar"):
-        plan = plans.split(spp, width * height, seed, scalar=False)
-    total = 0.0
-    for part in plan.passes:
-        sensor = loaded.sensors[sampler]
-        pixels = integrator.render(loaded.scene, sensor, part.seed, part.spp)
-        total = total + np.array(pixels) * (part.spp / spp)
+    backend, total = mi.variant().split("_")[0], 0.0
+    sensor = loaded.sensors[sampler]
+    if backend == "scalar" or spp * width * height <= plans.MOST_STATES:
+        return np.array(integrator.render(loaded.scene, sensor, seed, spp))
+    limits = plans.Limits(width * height, backend, indexed=False, learns=False)
+    for step in plans.steps(spp, limits):
+        number = plans.seed_of(seed, step.index)
+        pixels = integrator.render(loaded.scene, sensor, number, step.spp)
+        total = total + np.array(pixels) * (step.spp / spp)
     return total
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import threading
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -31,25 +30,23 @@ class Folder:
     Attributes:
         folder: where they are.
         data: the content of ``results.json``.
-        writing: held while a file is written; who ends the process takes it first.
     """
 
     def __init__(self, folder: Path, data: dict[str, Any]) -> None:
-        self.folder, self.data, self.writing = folder, data, threading.RLock()
+        self.folder, self.data = folder, data
 
     def save(self) -> None:
         """Write ``results.json``, whole or not at all."""
         scenes = [_without_empty_points(entry) for entry in self.data["scenes"]]
         text = json.dumps({**self.data, "scenes": scenes}, indent=1, allow_nan=False)
-        with self.writing, files.written_whole(self.folder / records.FILE) as partial:
+        with files.written_whole(self.folder / records.FILE) as partial:
             partial.write_text(text)
 
     def write_image(self, scene: str, name: str, pixels: np.ndarray, names) -> None:
         """Write ``SCENE/NAME.exr``, whole or not at all, in single precision."""
         target = self.folder / scene / f"{name}.exr"
         bitmap = channels.join(names, pixels)
-        with self.writing:
-            images.write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)
+        images.write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)
 
     def read_reference(self, scene: str) -> np.ndarray:
         """Return the reference of a scene, shape (height, width, 3)."""

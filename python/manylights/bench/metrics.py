@@ -5,20 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from manylights.bench import extras
+from manylights.rendering.noise import EPSILON, TRIM, divide, squared_scale, trimmed_mean
 
-#: Added to a reference pixel, as a share of the reference's mean: where the reference is dark, an
-#: error counts in relation to this, not to almost nothing.
-EPSILON = 0.05
-
-#: The share of pixels with the largest errors that a trimmed error leaves out: the mean of squares
-#: hangs on very few pixels in scenes where single samples are bright.
-TRIM = 0.001
-
-
-def squared_scale(reference: np.ndarray, epsilon: float = EPSILON) -> np.ndarray:
-    """Return what squared differences of each pixel are divided by, shape (height, width)."""
-    reference = np.asarray(reference, dtype=float)
-    return reference.mean(axis=2) ** 2 + (epsilon * reference.mean()) ** 2
+__all__ = [
+    "EPSILON",
+    "TRIM",
+    "flip_error",
+    "relative_errors",
+    "relative_mse",
+    "rmse",
+    "squared_scale",
+    "trimmed_mean",
+    "variance_error",
+]
 
 
 def relative_errors(
@@ -30,14 +29,7 @@ def relative_errors(
     the mean over the pixel's channels. Where both are zero in an all black reference it is zero.
     """
     difference = np.asarray(image, dtype=float) - np.asarray(reference, dtype=float)
-    return _divide(np.mean(difference**2, axis=2), squared_scale(reference, epsilon))
-
-
-def trimmed_mean(errors: np.ndarray, trim: float = TRIM) -> float:
-    """Return the mean without the largest values, the share ``trim`` of all, rounded up."""
-    ordered = np.sort(np.ravel(errors))
-    kept = ordered.size - int(np.ceil(trim * ordered.size))
-    return float(ordered[:kept].mean()) if kept else float(ordered.mean())
+    return divide(np.mean(difference**2, axis=2), squared_scale(reference, epsilon))
 
 
 def relative_mse(image: np.ndarray, reference: np.ndarray, trim: float = 0.0) -> float:
@@ -58,7 +50,7 @@ def variance_error(variance: np.ndarray, reference: np.ndarray) -> float:
         variance: of each pixel and channel.
         reference: estimate of the expected image.
     """
-    return float(_divide(np.mean(variance, axis=2), squared_scale(reference)).mean())
+    return float(divide(np.mean(variance, axis=2), squared_scale(reference)).mean())
 
 
 def flip_error(image: np.ndarray, reference: np.ndarray) -> float:
@@ -74,8 +66,3 @@ def flip_error(image: np.ndarray, reference: np.ndarray) -> float:
     pair = [np.ascontiguousarray(array, dtype=np.float32) for array in (reference, image)]
     _, mean, _ = flip.evaluate(*pair, "HDR", applyMagma=False)
     return float(mean)
-
-
-def _divide(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    zero = np.where(numerator > 0.0, np.inf, 0.0)
-    return np.divide(numerator, denominator, out=zero, where=denominator > 0.0)

@@ -396,10 +396,9 @@ class SceneRun:
 
     def _add_moments(self, candidate: Candidate, seed: int, image: np.ndarray) -> None:
         path = self._moments_path(candidate)
-        with self.found.writing:
-            moments = Moments.load(path)
-            moments.add(seed, image)
-            moments.save(path)
+        moments = Moments.load(path)
+        moments.add(seed, image)
+        moments.save(path)
 
     def _write_variance(self, candidate: Candidate) -> None:
         moments = Moments.load(self._moments_path(candidate))

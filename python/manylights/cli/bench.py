@@ -111,8 +111,7 @@ def _run(options) -> None:
     settings = runner.Settings(options.spp, _budget(options), options.seeds)
     run_with_bar(
         "measuring",
-        lambda report: runner.run(tasks, settings, found, report),
-        found.writing,
+        lambda bar: runner.run(tasks, settings, found, bar.report),
         lambda: f"interrupted, what was measured is in {found.folder}; the same command goes on",
     )
     say(f"wrote {found.folder / records.FILE}")

@@ -10,7 +10,6 @@ from manylights.cli.render import render_to
 from manylights.loading import integrators
 from manylights.output import images
 from manylights.progress import say
-from manylights.rendering import Job
 
 HELP = """\
 Generates a city at night with thousands of lights, renders it, and says how long that took.
@@ -53,5 +52,6 @@ def _run(options) -> None:
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
     count = sum(lights.count_kinds(loaded.scene).values())
     say(f"lights: {count:,}")
-    seconds = render_to(Job.of(loaded, spp=spp, seed=options.seed), target, options.threads)
+    wanted = {"spp": spp, "seed": options.seed, "threads": options.threads}
+    seconds = render_to(loaded, target, wanted).seconds
     print(f"{count:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")

@@ -7,6 +7,7 @@ import math
 
 from manylights import loading
 from manylights.loading import integrators
+from manylights.loading.parsing import MOST_SUBDIVISION
 from manylights.progress import say
 
 VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scalar_rgb)"
@@ -117,8 +118,8 @@ def seed(text: str) -> int:
 
 def levels(text: str) -> int:
     """A number of refinements: each makes four times as many faces."""
-    if not text.isdigit() or int(text) > 6:
-        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to 6")
+    if not text.isdigit() or int(text) > MOST_SUBDIVISION:
+        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to {MOST_SUBDIVISION}")
     return int(text)
 
 
@@ -136,6 +137,24 @@ def number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def share(text: str) -> float:
+    """A number above 0."""
+    value = number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number above 0, 0.02 is 2 %")
+    return value
+
+
+def duration(text: str) -> float:
+    """A time above 0, in seconds, or with its unit: 60, 60s, 10m, 1.5h."""
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    unit = text[-1:] if text[-1:] in units else ""
+    value = number(text.removesuffix(unit)) * units.get(unit, 1.0)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be a time above 0, as 60s, 10m or 1h")
+    return value
 
 
 def seconds(text: str) -> float:

@@ -3,40 +3,39 @@
 from __future__ import annotations
 
 import argparse
-import time
-from dataclasses import asdict
 from pathlib import Path
 
 from manylights import loading
 from manylights.cli import options as shared
+from manylights.errors import UsageError
 from manylights.loading import integrators
 from manylights.output import images
-from manylights.progress import run_with_bar, say, waiting
-from manylights.rendering import Job, render
-from manylights.rendering.checkpoint import Checkpoint, path_for
+from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
+from manylights.rendering import Progress, RenderResult, render
+from manylights.rendering.checkpoint import path_for
 
 HELP = """\
 Renders a scene to an OpenEXR file and writes a PNG preview beside it. SCENE is an XML
 file of Mitsuba, or a USD stage (.usd, .usda, .usdc, .usdz).
 
-The same scene, variant, number of samples and seed give the same image. Scalar
-variants render all samples in one go. JIT variants do so up to 4 million
-samples for the whole image; longer renders are split into passes of a power of
-two of samples per pixel, at least four passes and at most 16 million samples
-each. The first pass uses the seed, the others seeds derived from it, and each
-sample counts the same. Stratified samplers stratify within a pass. With a
-reconstruction filter wider than a pixel (anything but "box"), threads add to
-the same pixel in varying order: the last bits of the image are then the same
-from run to run only with --threads 1.
+The same scene, variant, number of samples and seed give the same image, bit for bit, with
+any number of threads. Long renders go in steps of some seconds; each pixel has one
+sequence of random numbers for all of them, and visibility is learnt once. That needs the
+sampler manylights_sobol, which replaces independent. With others each step has a sequence
+of its own, and steps are few and large.
 
-With --checkpoint the state of the render is kept in OUT.checkpoint.exr, a
-picture, too, after each pass that ends SECONDS or more after the last one was
-written. After a crash, a kill or Ctrl-C the same command goes on from there, and
-the image is the same, bit for bit, as without the interruption. The file is
-removed when the image is written. One of another job, of a changed scene or of
-another version is refused. In JIT variants the image is also the same as without
---checkpoint. Scalar variants render in passes then, of at most 4 million samples
-or 4 samples per pixel: the image has other noise than without.
+--until-noise X renders until the noise is X: the root of the mean relative variance of
+the pixels, without the worst 0.1 %; 0.02 is 2 %. Four independent images are rendered in
+turn, their differences tell the noise, and how many samples will be needed is predicted.
+--for TIME renders for so long. --spp is the limit of both (65536 without). The noise is
+in the attribute manylights.noise of the file.
+
+With --checkpoint the state of the render is kept in OUT.checkpoint.exr, a picture, too,
+after each step that ends SECONDS or more after the last one was written. After a crash, a
+kill or Ctrl-C the same command goes on from there, and the image is the same, bit for
+bit, as without interruption or checkpoint (but not with --for, which looks at the clock).
+The file is removed when the image is written. One of another job, of a changed scene or
+of another version is refused.
 """
 
 
@@ -53,14 +52,21 @@ def add(commands, common) -> None:
     shared.add_scene(parser)
     parser.add_argument("-o", "--output", required=True, metavar="OUT.exr", help="image to write")
     parser.add_argument(
-        "--spp", type=shared.positive, default=0, help="samples per pixel (default: the scene's)"
+        "--spp", type=shared.positive, help="samples per pixel (default: the scene's)"
     )
+    _add_targets(parser)
     parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
     parser.add_argument(
         "--integrator",
         metavar="NAME",
         help="keep: the scene's own; any other name: that plugin (default: manylights_direct "
         "instead of direct, manylights_volpath instead of path, volpath or none, any other stays)",
+    )
+    parser.add_argument(
+        "--sampler",
+        metavar="NAME",
+        help="keep: the scene's own; any other name: that plugin (default: manylights_sobol "
+        "instead of independent or none, any other stays)",
     )
     parser.add_argument(
         "--set",
@@ -84,6 +90,22 @@ def add(commands, common) -> None:
     parser.set_defaults(command=_run)
 
 
+def _add_targets(parser) -> None:
+    parser.add_argument(
+        "--until-noise",
+        type=shared.share,
+        metavar="X",
+        help="render until the noise is X (0.02 is 2 %%) or --spp is reached",
+    )
+    parser.add_argument(
+        "--for",
+        dest="seconds",
+        type=shared.duration,
+        metavar="TIME",
+        help="render for so long (60s, 10m, 1h) or until --spp is reached",
+    )
+
+
 def _parameter_help() -> str:
     """Return the parameters of our integrators as a table for the help."""
     lines = []
@@ -103,48 +125,52 @@ def _run(options) -> None:
     shared.start(options)
     stage = shared.usd_options(options)
     with waiting("loading"):
-        loaded = loading.load(options.scene, defines, options.integrator, settings, stage)
+        loaded = loading.load(
+            options.scene, defines, options.integrator, settings, stage, options.sampler
+        )
     for note in loaded.notes:
         say(note)
-    # What changes the image and is not in a file: a checkpoint of other choices is refused.
-    choices = {"integrator": options.integrator, "set": settings, "define": defines}
-    choices |= {"usd": asdict(stage)} if stage != loading.UsdOptions() else {}
-    keeps_state = options.checkpoint is not None
-    job = Job.of(loaded, options.sensor, options.spp, options.seed, choices, keeps_state)
-    checkpoint = _open_checkpoint(job, target, options.checkpoint) if keeps_state else None
-    render_to(job, target, options.threads, checkpoint)
+    count = len(loaded.scene.sensors())
+    if not 0 <= options.sensor < count:
+        raise UsageError(f"--sensor {options.sensor}: the scene has {count}, counted from 0")
+    names = ("spp", "seed", "sensor", "until_noise", "seconds", "threads")
+    wanted = {name: getattr(options, name) for name in names}
+    if options.checkpoint is not None:
+        wanted |= {"checkpoint": path_for(target), "checkpoint_seconds": options.checkpoint}
+    render_to(loaded, target, wanted)
 
 
-def _open_checkpoint(job: Job, target: Path, seconds: float) -> Checkpoint:
-    """Return the checkpoint of a render, and say so if the render goes on from it."""
-    found = Checkpoint(path_for(target), job, seconds)
-    if found.samples:
-        say(f"checkpoint: {found.describe()}, the render goes on from there")
-    return found
+def render_to(loaded: loading.LoadedScene, target: Path, wanted: dict) -> RenderResult:
+    """Render with a progress bar, and write the images.
 
+    Args:
+        loaded: the scene.
+        target: the OpenEXR file.
+        wanted: arguments of ``rendering.render``.
+    """
+    seen: list[Progress] = []
 
-def render_to(
-    job: Job, target: Path, threads: int | None = None, checkpoint: Checkpoint | None = None
-) -> float:
-    """Render with a progress bar, write the images, and return the seconds of the render."""
-    about_files = {}
-    if checkpoint is not None:
-        about_files = {
-            "writing": checkpoint.writing,
-            "farewell": checkpoint.farewell,
-            "begin": checkpoint.fraction,
-        }
-    start = time.perf_counter()
-    bitmap = run_with_bar(
-        "rendering", lambda report: render(job, report, threads, checkpoint), **about_files
-    )
-    seconds = time.perf_counter() - start
-    bitmap = images.exposed(bitmap, job.loaded.exposure)
-    written, notes = images.write_images(bitmap, target)
-    if checkpoint is not None:
-        checkpoint.remove()
-    for note in notes:
+    def work(bar: Bar) -> RenderResult:
+        def report(progress: Progress) -> None:
+            if not seen and progress.kept:
+                say(f"checkpoint: {progress.kept}, the render goes on from there")
+                bar.begin(progress.fraction)
+            seen[:] = [progress]
+            if progress.noise is not None:
+                bar.text = f"noise {progress.noise:.3g}, {progress.samples} spp"
+            bar.report(progress.fraction)
+
+        return render(loaded, output=target, progress=report, **wanted)
+
+    def farewell() -> str:
+        kept = seen[0].kept if seen else None
+        return f"interrupted, {kept}; the same command goes on" if kept else NOTHING_WRITTEN
+
+    result = run_with_bar("rendering", work, farewell)
+    for note in result.notes[len(loaded.notes) :]:
         say(note)
-    names = " and ".join(str(path) for path in written)
-    say(f"rendered in {seconds:.1f} s, wrote {names}")
-    return seconds
+    names = " and ".join(str(path) for path in result.files)
+    noise = "" if result.noise is None else f", noise {result.noise:.3g}"
+    how_many = f"{result.samples} samples per pixel{noise}"
+    say(f"rendered in {result.seconds:.1f} s, {how_many}, wrote {names}")
+    return result

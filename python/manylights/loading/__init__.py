@@ -3,11 +3,12 @@
 - ``variants``: which of Mitsuba's variants this machine can run;
 - ``parsing``: XML or USD to Mitsuba's parsed form, and from there to objects;
 - ``integrators``: replaces Mitsuba's integrators by ours and sets parameters;
+- ``samplers``: replaces Mitsuba's sampler by ours;
 - ``merging``: makes one mesh of many emissive ones;
 - ``load``: all of it, for the command line.
 """
 
-from manylights.loading.load import LoadedScene, load
+from manylights.loading.load import LoadedScene, as_loaded, load
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
@@ -22,6 +23,7 @@ __all__ = [
     "LoadedScene",
     "ParsedScene",
     "UsdOptions",
+    "as_loaded",
     "default_variant",
     "files_of",
     "has_backend",

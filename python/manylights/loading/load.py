@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 
-from manylights.loading import integrators, merging
+from manylights.errors import UsageError
+from manylights.loading import integrators, merging, samplers
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
     instantiate,
     parse,
+    parse_description,
     search_beside,
 )
 from manylights.threads import threads_for_files
@@ -28,6 +32,7 @@ class LoadedScene:
         notes: what was said about reading it and choosing them.
         files: what it was read from, the scene file first.
         exposure: factor of the camera, which images are multiplied by.
+        choices: what was chosen and is not in the files, by the name of the option.
     """
 
     scene: object
@@ -35,6 +40,7 @@ class LoadedScene:
     notes: list[str]
     files: list[Path] = field(default_factory=list)
     exposure: float = 1.0
+    choices: dict[str, Any] = field(default_factory=dict)
 
 
 def load(
@@ -43,8 +49,9 @@ def load(
     integrator: str | None = None,
     settings: dict | None = None,
     usd_options: UsdOptions | None = None,
+    sampler: str | None = None,
 ) -> LoadedScene:
-    """Load a scene and choose its integrator (see ``integrators.choose``).
+    """Load a scene and choose its integrator (see ``integrators.choose``) and its sampler.
 
     Args:
         path: an XML file or a USD stage.
@@ -53,16 +60,77 @@ def load(
             plugin's name.
         settings: parameters to set on the integrator. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
+        sampler: ``None`` (``independent`` becomes ours), ``"keep"`` or a plugin's name.
     """
     with search_beside(path), threads_for_files():
         parsed = parse(path, defines, usd_options)
-        notes = parsed.notes + integrators.choose(parsed.state, integrator, settings or {})
-        integrators.fix_block_size(parsed.state)
-        nodes = parsed.state.nodes
-        count = sum(node.type == mi.ObjectType.Integrator for node in nodes)
-        notes += _merge_emitters(parsed)
-        scene = instantiate(parsed)
-        return LoadedScene(scene, max(count, 1), notes, parsed.files, parsed.exposure)
+        loaded = _choose_and_make(parsed, integrator, settings or {}, sampler)
+    loaded.choices["define"] = defines or {}
+    if usd_options is not None and usd_options != UsdOptions():
+        loaded.choices["usd"] = asdict(usd_options)
+    return loaded
+
+
+def load_description(
+    description: dict, integrator: str | None = None, settings: dict | None = None
+) -> LoadedScene:
+    """Do the same with a dictionary as for ``mi.load_dict``."""
+    with threads_for_files():
+        parsed = parse_description(description)
+        return _choose_and_make(parsed, integrator, settings or {}, None)
+
+
+def as_loaded(scene, integrator=None) -> tuple[LoadedScene, object]:
+    """Load whatever describes a scene, if it is not loaded yet.
+
+    Args:
+        scene: a path, a dictionary, an ``mi.Scene`` or a ``LoadedScene``.
+        integrator: ``None``, ``"keep"``, a plugin's name, a dictionary or an ``mi.Integrator``.
+
+    Returns:
+        The scene, and the integrator to use in place of the scene's, ``None`` for the scene's.
+
+    Raises:
+        UsageError: either is something else.
+    """
+    if not (integrator is None or isinstance(integrator, (str, dict, mi.Integrator))):
+        raise UsageError(
+            f"integrator {integrator!r}: must be a name, a dictionary or an mi.Integrator"
+        )
+    if isinstance(scene, (mi.Scene, LoadedScene)):
+        if isinstance(scene, mi.Scene):
+            scene = LoadedScene(scene, 1, [])
+        return scene, _integrator(integrator)
+    own = integrator if isinstance(integrator, mi.Integrator) else None
+    settings = dict(integrator) if isinstance(integrator, dict) else {}
+    name = settings.pop("type", None) if settings else ("keep" if own else integrator)
+    if isinstance(scene, dict):
+        return load_description(scene, name, settings), own
+    if isinstance(scene, (str, os.PathLike)):
+        return load(os.fspath(scene), None, name, settings), own
+    raise UsageError(f"scene {scene!r}: must be a path, a dictionary or an mi.Scene")
+
+
+def _integrator(wanted):
+    """Return an integrator that was asked for, ``None`` for that of the scene."""
+    if wanted is None or wanted == "keep" or isinstance(wanted, mi.Integrator):
+        return None if wanted == "keep" else wanted
+    return mi.load_dict({"type": wanted} if isinstance(wanted, str) else wanted)
+
+
+def _choose_and_make(
+    parsed: ParsedScene, integrator: str | None, settings: dict, sampler: str | None
+) -> LoadedScene:
+    notes = parsed.notes + integrators.choose(parsed.state, integrator, settings)
+    notes += samplers.choose(parsed.state, sampler)
+    integrators.fix_block_size(parsed.state)
+    nodes = parsed.state.nodes
+    count = sum(node.type == mi.ObjectType.Integrator for node in nodes)
+    notes += _merge_emitters(parsed)
+    choices = {"integrator": integrator, "set": settings}
+    choices |= {"sampler": sampler} if sampler else {}
+    scene = instantiate(parsed)
+    return LoadedScene(scene, max(count, 1), notes, parsed.files, parsed.exposure, choices)
 
 
 def _merge_emitters(parsed: ParsedScene) -> list[str]:

@@ -17,6 +17,10 @@ from manylights.errors import UsageError, one_line
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
 
+#: Each level has four times as many faces: more fill the memory.
+MOST_SUBDIVISION = 6
+
+
 @dataclass(frozen=True)
 class UsdOptions:
     """How a USD stage is read: the arguments of ``manylights.usd.load``, which says what each is.
@@ -68,25 +72,33 @@ def parse(
     """
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such file")
-    config = mi.parser.ParserConfig(mi.variant())
     if Path(path).suffix.lower() in USD_ENDINGS:
-        return _parse_usd(config, path, defines or {}, usd_options or UsdOptions())
+        return _parse_usd(path, defines or {}, usd_options or UsdOptions())
+    config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **(defines or {}))
     mi.parser.transform_upgrade(config, state)
     return ParsedScene(config, state, files_of(state))
 
 
-def _parse_usd(config, path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
+def _parse_usd(path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
     if defines:
         raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
     description = import_usd(path).load(path, **asdict(options))
-    state = mi.parser.parse_dict(config, description)
+    parsed = parse_description(description)
     # A stage composes layers that no node of the scene names.
-    files = [*map(Path, description.files), *files_of(state)]
-    notes = [note.text for note in description.notes]
-    if description.exposure != 1.0:
-        notes.append(f"camera: its exposure brightens the image {description.exposure:g} times")
-    return ParsedScene(config, state, files, notes, description.exposure)
+    parsed.files = [*map(Path, description.files), *files_of(parsed.state)]
+    return parsed
+
+
+def parse_description(description: dict) -> ParsedScene:
+    """Parse a dictionary as for ``mi.load_dict``, for example one of ``manylights.usd.load``."""
+    config = mi.parser.ParserConfig(mi.variant())
+    state = mi.parser.parse_dict(config, description)
+    notes = [note.text for note in getattr(description, "notes", ())]
+    exposure = getattr(description, "exposure", 1.0)
+    if exposure != 1.0:
+        notes.append(f"camera: its exposure brightens the image {exposure:g} times")
+    return ParsedScene(config, state, [], notes, exposure)
 
 
 def import_usd(path: str):

@@ -23,10 +23,18 @@ COUNTS = {
 #: Those that count work, for each sample.
 WORK = ("candidates", "node_visits")
 
-#: The film's sums in a checkpoint, as the two parts of ``rendering.sums.Sums``: a prefix each.
-SUM, REST = "checkpoint_sum.", "checkpoint_rest."
+#: The film's sums in a checkpoint, in the parts of ``rendering.sums.Sums``: a prefix each.
+SUM_PARTS = ("sum", "rest", "tail")
 
 _formats = mi.Bitmap.PixelFormat
+
+
+def sums(sequences: int) -> list[str]:
+    """Return the prefixes of the channels of a checkpoint: the parts of the sums of a sequence,
+    then those of the next one.
+    """
+    numbers = ["", *(str(number) for number in range(1, sequences))]
+    return [f"checkpoint{number}_{part}." for number in numbers for part in SUM_PARTS]
 
 
 def read(path: str | Path, prefix: str = ""):

@@ -1,14 +1,16 @@
-"""Renders a loaded scene, in passes where that is useful, and reports the progress.
+"""Renders a scene step by step, and reports the progress.
 
-- ``plan``: which passes there are, as pure numbers;
-- ``sums``: what they add up to;
+- ``plan``: which steps and passes there are, and ``targets``: how many for a noise or a time; as
+  pure numbers;
+- ``sums``, ``noise``: what they add up to, and how noisy that is;
+- ``driver``: has Mitsuba render a step, without files;
+- ``develop``, ``state``: images of sums; all that a render has so far;
 - ``job``: a render with all that its image depends on;
-- ``passes``: one pass after the other, without files;
-- ``checkpoint``: keeps the sums in a file;
+- ``checkpoint``: keeps the state in a file;
 - ``render``: puts these together.
 """
 
 from manylights.rendering.job import Job
-from manylights.rendering.render import render
+from manylights.rendering.render import Progress, RenderResult, render
 
-__all__ = ["Job", "render"]
+__all__ = ["Job", "Progress", "RenderResult", "render"]

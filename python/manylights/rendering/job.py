@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,14 @@ import numpy as np
 from manylights.errors import UsageError
 from manylights.loading import LoadedScene
 from manylights.rendering import plan as plans
+from manylights.rendering.driver import ENTRIES, Driver
+from manylights.rendering.targets import MOST_SPP, Course, History
+
+#: Of the files that keep the state of a job; another one is refused.
+FORMAT = 2
+
+#: A target counts as reached up to this factor: predictions are not exact.
+NEARLY = 1.1
 
 
 @dataclass
@@ -24,59 +32,80 @@ class Job:
         loaded: the scene.
         index: of the sensor, from 0.
         seed: of the random numbers.
-        plan: the passes.
-        choices: what else was chosen on the command line, by the name of the option.
+        course: which steps there are.
+        driver: renders them.
     """
 
     loaded: LoadedScene
     index: int
     seed: int
-    plan: plans.Plan
-    choices: dict[str, Any] = field(default_factory=dict)
+    course: Course
+    driver: Driver
 
     @staticmethod
     def of(
         loaded: LoadedScene,
         sensor: int = 0,
-        spp: int = 0,
+        spp: int | None = None,
         seed: int = 0,
-        choices: dict[str, Any] | None = None,
-        keeps_state: bool = False,
+        noise: float | None = None,
+        seconds: float | None = None,
+        integrator=None,
     ) -> Job:
         """Plan a render.
 
         Args:
             loaded: what ``load`` returned.
             sensor: index of the sensor.
-            spp: samples per pixel, >= 1, or 0 for what the scene's sampler says.
+            spp: samples per pixel, >= 1, at most if there is a target. Default: what the scene's
+                sampler says, with a target 65536.
             seed: of the random numbers, 0 to 2^32 - 1.
-            choices: what else the image depends on, by the name of the option. Default: nothing.
-            keeps_state: will the state be kept between passes?
+            noise: to stop at, relative, > 0. Default: none.
+            seconds: to stop after, > 0. Default: none.
+            integrator: ``mi.Integrator``. Default: the scene's.
 
         Raises:
-            UsageError: there is no such sensor.
+            UsageError: there is no such sensor, or a number is out of range.
         """
         sensors = loaded.scene.sensors()
-        if not 0 <= sensor < len(sensors):
-            raise UsageError(f"--sensor {sensor}: the scene has {len(sensors)}, counted from 0")
-        spp = spp or sensors[sensor].sampler().sample_count()
-        scalar = is_scalar()
-        if scalar and not keeps_state:
-            plan = plans.whole(spp, seed)
-        else:
-            pixels = int(np.prod(sensors[sensor].film().crop_size()))
-            plan = plans.split(spp, pixels, seed, scalar)
-        return Job(loaded, sensor, seed, plan, choices or {})
-
-    @property
-    def sensor(self):
-        """Mitsuba's sensor."""
-        return self.loaded.scene.sensors()[self.index]
+        check("sensor", sensor, 0 <= sensor < len(sensors), f"0 to {len(sensors) - 1}")
+        check("spp", spp, spp is None or 1 <= spp < 2**32, "1 to 4294967295")
+        check("seed", seed, 0 <= seed < 2**32, "0 to 4294967295")
+        for name, value in (("until_noise", noise), ("seconds", seconds)):
+            check(name, value, value is None or 0.0 < value < np.inf, "a number above 0")
+        driver = Driver(loaded, sensors[sensor], integrator)
+        if spp is None:
+            aimless = noise is None and seconds is None
+            spp = driver.sensor.sampler().sample_count() if aimless else MOST_SPP
+        return Job(loaded, sensor, seed, Course(spp, driver.limits(), noise, seconds), driver)
 
     @property
     def film(self):
-        """The sensor's film, which each pass overwrites."""
-        return self.sensor.film()
+        """The sensor's film, which each step overwrites."""
+        return self.driver.sensor.film()
+
+    def seed_of(self, step: plans.Step) -> int:
+        """Return the seed of a step: that of its sequence."""
+        number = step.scramble if self.course.limits.indexed else step.index
+        return plans.seed_of(self.seed, number)
+
+    def notes(self, done: History, noise: float | None) -> list[str]:
+        """Return what is to be said at the end of a render."""
+        course, result = self.course, []
+        if not course.limits.indexed and done.steps > 1:
+            name = self.driver.sensor.sampler().class_name()
+            result.append(
+                f"sampler: {name} has no samples by index: {done.steps} steps, each with a "
+                "sequence of its own (manylights_sobol has one for all)"
+            )
+        if course.noise is not None and noise is None:
+            result.append(f"noise: not known, {done.spp} samples per pixel are too few")
+        elif course.noise is not None and noise > NEARLY * course.noise:
+            result.append(
+                f"noise: {noise:.3g} was reached and not {course.noise:g}, with "
+                f"{done.spp} samples per pixel"
+            )
+        return result
 
     def facts(self) -> dict[str, Any]:
         """Return all that the image depends on, for JSON."""
@@ -85,20 +114,19 @@ class Job:
         width, height = map(int, self.film.crop_size())
         return {
             "version": f"manylights {__version__}, Mitsuba {mi.__version__}",
+            "format": FORMAT,
             "variant": mi.variant(),
-            "spp": self.plan.spp,
+            "spp": self.course.spp,
+            "until_noise": self.course.noise,
+            "seconds": self.course.seconds,
             "seed": self.seed,
             "sensor": self.index,
             "size": f"{width} x {height}",
-            "samples_per_pass": self.plan.samples_per_pass,
-            **self.choices,
-            "files": _digests(self.loaded.files),
+            "sampler": self.driver.sensor.sampler().class_name(),
+            "steps": self.course.limits.largest(),
+            **self.loaded.choices,
+            "files": _digests(self.loaded.files) or {"scene": _digest(self.loaded.scene)},
         }
-
-
-def is_scalar() -> bool:
-    """Is the current variant a scalar one?"""
-    return mi.variant().startswith("scalar")
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
@@ -116,6 +144,12 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     return changes
 
 
+def check(name: str, value, allowed: bool, what: str) -> None:
+    """Raise ``UsageError`` with name, value and what it must be, unless it is allowed."""
+    if not allowed:
+        raise UsageError(f"{name} {value}: must be {what}")
+
+
 def _digests(paths: list[Path]) -> dict[str, str]:
     """Return SHA-256 of the files by their names, seen from the folder of the first."""
     folder = paths[0].parent if paths else ""
@@ -123,6 +157,24 @@ def _digests(paths: list[Path]) -> dict[str, str]:
         os.path.relpath(path, folder): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in dict.fromkeys(paths)
     }
+
+
+def _digest(scene) -> str:
+    """Return SHA-256 of all parameters of a scene that came from no file."""
+    digest = hashlib.sha256()
+    parameters = mi.traverse(scene)
+    for name, value in parameters:
+        *_, flags = parameters.properties[name]
+        # Renders themselves change these.
+        if flags & mi.ParamFlags.ReadOnly or name.endswith(ENTRIES):
+            continue
+        # Objects without an id have their address in the name.
+        digest.update(f"{name.rpartition('.')[2]} {type(value).__name__} ".encode())
+        try:
+            digest.update(np.ascontiguousarray(getattr(value, "matrix", value)).tobytes())
+        except (TypeError, ValueError):
+            digest.update(str(value).encode())
+    return digest.hexdigest()
 
 
 def _words(value: Any) -> str:

@@ -1,31 +1,213 @@
-"""Renders a job, and keeps its state in a file if asked to."""
+"""Renders a job: step by step, with its state in a file if that is wanted.
+
+Visibility of lights is learnt once, in the first step. How many samples a noise needs is predicted,
+from four independent images that are rendered in turn.
+"""
 
 from __future__ import annotations
 
-from manylights.rendering.checkpoint import Checkpoint
-from manylights.rendering.job import Job
-from manylights.rendering.passes import Report, develop, render_passes
-from manylights.rendering.sums import Sums
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from manylights import loading
+from manylights.errors import UsageError
+from manylights.output import images
+from manylights.rendering.checkpoint import ATTRIBUTE, Checkpoint
+from manylights.rendering.develop import develop
+from manylights.rendering.job import Job, check
+from manylights.rendering.state import State
 from manylights.threads import thread_count
 
 
+@dataclass
+class Progress:
+    """How far a render is.
+
+    Attributes:
+        fraction: of what is to be done, as far as is known, from 0 to 1.
+        samples: per pixel, those that are done.
+        seconds: that they took, those of interrupted processes, too.
+        noise: relative, of the last round; None if it is not known.
+        kept: what the checkpoint holds, in words; None without or before the first.
+    """
+
+    fraction: float
+    samples: int
+    seconds: float
+    noise: float | None = None
+    kept: str | None = None
+
+
+@dataclass
+class RenderResult:
+    """An image, and what is known about it.
+
+    Attributes:
+        image: shape (height, width, channels), single precision, as ``mi.render`` returns it,
+            multiplied by the exposure of a USD camera.
+        bitmap: the same as ``mi.Bitmap``, with names and the number format that the film asks for.
+        variance: of each pixel's mean, shape (height, width, colours), in squared units of the
+            image; None if it is not known: only renders with a target find it.
+        noise: the root of the mean relative variance of the pixels, without the largest 0.1 % of
+            them: 0.02 is 2 %. None if it is not known.
+        samples: per pixel.
+        seconds: of rendering, those of interrupted processes, too.
+        notes: lines about what was replaced, left out or not reached.
+        files: that were written.
+    """
+
+    image: np.ndarray
+    bitmap: object
+    variance: np.ndarray | None
+    noise: float | None
+    samples: int
+    seconds: float
+    notes: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+
+
 def render(
-    job: Job,
-    report: Report = lambda fraction: None,
+    scene,
+    *,
+    spp: int | None = None,
+    seed: int = 0,
+    sensor: int = 0,
+    integrator=None,
+    until_noise: float | None = None,
+    seconds: float | None = None,
+    output: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    checkpoint_seconds: float = 60.0,
+    progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
-    checkpoint: Checkpoint | None = None,
-):
-    """Render and return the film's ``mi.Bitmap`` with all its channels, weights divided out.
+) -> RenderResult:
+    """Render a scene: a number of samples, or until an image is good enough or a time is up.
+
+    The same scene, variant, samples and seed give the same bits, with any number of threads and
+    however often it was interrupted; so does ``until_noise``. The current variant is used.
 
     Args:
-        job: what to render.
-        report: called with the finished fraction, from 0 to 1; may come from another thread.
-        threads: CPU threads of the render, >= 1, or ``None`` for what Mitsuba has set.
-        checkpoint: what to go on from, and where to keep the state. Default: nothing is kept.
+        scene: path of an XML file or a USD stage; a dictionary as for ``mi.load_dict``, for example
+            of ``manylights.usd.load``; an ``mi.Scene``, which is rendered as it is; or what
+            ``manylights.loading.load`` returned. Of files and dictionaries ``direct``, ``path`` and
+            ``volpath`` are replaced by our integrators, ``independent`` by ``manylights_sobol``.
+        spp: samples per pixel, 1 or more; with a target the most there may be. Default: what the
+            scene's sampler says, with a target 65536.
+        seed: of the random numbers, 0 to 4294967295.
+        sensor: index of the sensor, from 0.
+        integrator: ``None`` for the choice above, ``"keep"`` for the scene's own, the name of a
+            plugin, a dictionary of a plugin and its parameters, or an ``mi.Integrator``.
+        until_noise: render until ``RenderResult.noise`` is this, above 0: 0.02 is 2 %.
+        seconds: render for so long, above 0. The last step may end later, by its length or 5 %.
+        output: file (.exr) to write the image to, with a PNG beside it. Default: none.
+        checkpoint: file (.exr) that keeps the state; if there is one of the same render it goes on
+            from there. Removed once there is an image. Default: the state is not kept.
+        checkpoint_seconds: at least between two writings of it.
+        progress: called before the first step and after each, in scalar variants also in between
+            and from other threads. What it raises ends the render.
+        threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
+
+    Raises:
+        UsageError: (a ``ValueError``) a number out of range, no such file or sensor, a checkpoint
+            of another render.
+        RuntimeError: Mitsuba cannot read or render the scene.
     """
-    sums = Sums() if checkpoint is None else checkpoint.sums
+    check("threads", threads, threads is None or threads >= 1, "1 or more")
+    target = None if output is None else images.check_output(str(output))
+    loaded, own = loading.as_loaded(scene, integrator)
+    job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own)
+    store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     with thread_count(threads):
-        for so_far in render_passes(job, sums, report):
-            if checkpoint is not None and so_far.passes < len(job.plan.passes):
-                checkpoint.keep()
-    return develop(job.film, sums)
+        state = run(job, store, progress or (lambda _: None))
+    return _finished(job, state, store, target)
+
+
+def _finished(job: Job, state: State, store: Checkpoint | None, target: Path | None):
+    result = result_of(job, state)
+    if target is not None:
+        result.files, notes = images.write_images(result.bitmap, target)
+        result.notes += notes
+    if store is not None:
+        store.remove()
+    return result
+
+
+def _store(path: str | Path, job: Job, seconds: float) -> Checkpoint:
+    check("checkpoint_seconds", seconds, seconds > 0.0, "above 0")
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise UsageError(f"checkpoint {path}: it is an OpenEXR file, end the name in .exr")
+    if not path.parent.is_dir():
+        raise UsageError(f"checkpoint {path}: there is no folder {path.parent}")
+    return Checkpoint(path, job, seconds)
+
+
+def run(
+    job: Job,
+    store: Checkpoint | None,
+    progress: Callable[[Progress], None],
+    clock: Callable[[], float] = time.perf_counter,
+) -> State:
+    """Render the steps of a job that ``store`` does not have, and return the state at the end."""
+    state = (store and store.restore()) or State.empty(job.course.sequences)
+    history, driver = state.history, job.driver
+
+    def tell(fraction_of_step: float = 0.0, spp: int = 0) -> None:
+        spent = clock() - start
+        progress(_progress(job, state, store, fraction_of_step * spp, spent))
+
+    start = clock()
+    tell()
+    driver.learn(state.learnt)
+    try:
+        while (step := job.course.next_step(history)) is not None:
+            start = clock()
+            seed = job.seed_of(step)
+            raw = driver.render(step, seed, job.course.spp, lambda done: tell(done, step.spp))
+            state.channels = state.channels or driver.channels()
+            state.add(step, raw, clock() - start)
+            if job.course.round_is_complete(history):
+                spread = state.spread(driver.adjoint)
+                history.noises.append(spread.noise if spread else float("nan"))
+            # What the sums took is part of the time, too.
+            history.add_seconds(clock() - start - history.last_seconds)
+            start = clock()
+            if store is not None and job.course.next_step(history) is not None:
+                state.learnt = driver.learnt()
+                store.keep(state)
+            history.seconds += clock() - start
+            start = clock()
+            tell()
+    finally:
+        driver.end()
+    return state
+
+
+def result_of(job: Job, state: State) -> RenderResult:
+    """Return the image of a state. The scene's film holds it then."""
+    driver, exposure = job.driver, job.loaded.exposure
+    image, bitmap = develop(job.film, state.total(driver.adjoint), exposure)
+    spread = state.spread(driver.adjoint)
+    noise = None if spread is None else spread.noise
+    if noise is not None:
+        bitmap.metadata()[ATTRIBUTE + "noise"] = json.dumps(noise)
+    variance = None if spread is None else spread.variance * np.float32(exposure**2)
+    history, notes = state.history, job.loaded.notes + job.notes(state.history, noise)
+    return RenderResult(image, bitmap, variance, noise, history.spp, history.seconds, notes)
+
+
+def _progress(job: Job, state: State, store, begun: float, spent: float) -> Progress:
+    """Return how far a render is with some samples of a step and some seconds of it."""
+    history, course = state.history, job.course
+    seconds = history.seconds + spent
+    fraction = (history.spp + begun) / course.predicted_spp(history.noises)
+    if course.seconds is not None:
+        fraction = max(fraction, seconds / course.seconds)
+    noise = history.noises[-1] if history.noises else None
+    kept = store.describe() if store is not None else None
+    return Progress(min(fraction, 1.0), history.spp, seconds, noise, kept)

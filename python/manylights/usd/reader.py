@@ -6,6 +6,7 @@ import numpy as np
 
 from manylights.errors import one_line
 from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
+from manylights.loading.parsing import MOST_SUBDIVISION, UsdOptions
 from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
 from manylights.usd.description import instantiate
@@ -17,9 +18,6 @@ from manylights.usd.traversal import collect
 
 #: What prims of a stage may be for.
 PURPOSES = ("default", "render", "proxy", "guide")
-
-#: Each level has four times as many faces: more fill the memory.
-MOST_SUBDIVISION = 8
 
 
 class SceneDict(dict):
@@ -96,35 +94,31 @@ def load(
     return result
 
 
-def describe(
-    path,
-    *,
-    time=None,
-    camera=None,
-    purposes=("default", "render"),
-    subdivision=None,
-    default_light=False,
-    legacy_lights=False,
-    blender_light_units=False,
-) -> SceneDict:
-    """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet."""
-    purposes = _purposes(purposes)
-    if subdivision is not None and not 0 <= subdivision <= MOST_SUBDIVISION:
-        raise StageError(f"subdivision {subdivision}: 0 to {MOST_SUBDIVISION} levels are possible")
-    notes = Notes()
+def describe(path, **choices) -> SceneDict:
+    """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet.
+
+    Args:
+        path: of the stage.
+        choices: the other arguments of :func:`load`.
+    """
+    options = UsdOptions(**choices)
+    levels = options.subdivision
+    if levels is not None and not 0 <= levels <= MOST_SUBDIVISION:
+        raise StageError(f"subdivision {levels}: 0 to {MOST_SUBDIVISION} levels are possible")
+    notes, purposes = Notes(), _purposes(options.purposes)
     with guarded(path):
         stage = open_stage(path, notes)
         context = Context(
             stage=stage,
-            time=time_of(stage, time),
+            time=time_of(stage, options.time),
             notes=notes,
             purposes=purposes,
-            subdivision=subdivision,
-            legacy_lights=legacy_lights,
-            blender_light_units=blender_light_units,
+            subdivision=levels,
+            legacy_lights=options.legacy_lights,
+            blender_light_units=options.blender_light_units,
         )
         skinning.bake(context)
-        return _read(context, camera, default_light)
+        return _read(context, options.camera, options.default_light)
 
 
 def _purposes(purposes) -> tuple[str, ...]:

@@ -1,0 +1,414 @@
+"""`manylights.render`: the same bits however a job is run, targets that are met, and its inputs."""
+
+import json
+import time
+from pathlib import Path
+
+import manylights
+import mitsuba as mi
+import numpy as np
+import pytest
+from manylights import cli, loading
+from manylights.errors import UsageError
+from manylights.loading import samplers
+from manylights.rendering import Job, noise, plan
+from manylights.rendering import develop as rendering
+from manylights.rendering.sums import Sums
+
+from tests import statistics_tools as tools
+from tests.conftest import require_variant
+
+SCENES = Path(__file__).parent.parent / "scenes"
+
+VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
+
+
+@pytest.fixture
+def short_steps(monkeypatch):
+    """Also small images are rendered in many steps: of 4096 samples at most."""
+    monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
+    monkeypatch.setattr(plan, "MOST_SAMPLES", dict.fromkeys(plan.MOST_SAMPLES, 2**12))
+
+
+def loaded(name="many_bulbs", width=40, height=24, sampler=None, filter_type="gaussian"):
+    """A scene of the folder with the default film's filter, which is wider than a pixel."""
+    path = SCENES / f"{name}.xml"
+    defines = {"resx": str(width), "resy": str(height)}
+    with loading.search_beside(str(path)):
+        parsed = loading.parse(str(path), defines)
+        for node in parsed.state.nodes:
+            if node.type == mi.ObjectType.ReconstructionFilter:
+                node.props = mi.Properties(filter_type)
+        samplers.choose(parsed.state, sampler)
+        scene = loading.instantiate(parsed)
+    return loading.LoadedScene(scene, 1, [])
+
+
+# ---------------------------------------------------------------------------------- the same bits
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_threads_do_not_change_the_bits(short_steps, variant):
+    require_variant(variant)
+    scene = loaded()
+    one, two, three = (
+        manylights.render(scene, spp=13, seed=3, threads=threads).image.tobytes()
+        for threads in (1, 2, 3)
+    )
+    assert one == two == three
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_steps_of_several_processes_add_up_to_the_same_bits(short_steps, variant):
+    """Each has its own scene; the second one gets what the first has learnt, and goes backwards."""
+    require_variant(variant)
+    whole = manylights.render(loaded(), spp=19, seed=5)
+    first, second = (Job.of(loaded(), spp=19, seed=5) for _ in range(2))
+    steps = list(plan.steps(19, first.course.limits))
+    assert len(steps) == 5 and first.course.limits.learns
+    sums = [Sums(), Sums()]
+
+    def render(job, step, to):
+        to.add(job.driver.render(step, job.seed_of(step), 19, lambda done: None))
+
+    for step in steps[:3]:
+        render(first, step, sums[0])
+    learnt = first.driver.learnt()
+    assert learnt.size
+    second.driver.learn(learnt)
+    for step in reversed(steps[3:]):
+        render(second, step, sums[1])
+    total = Sums()
+    total.merge(sums[1], sums[0])
+    image = rendering.develop(first.film, total.rounded)[0]
+    assert image.tobytes() == whole.image.tobytes()
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_short_renders_are_those_of_mitsuba(variant):
+    require_variant(variant)
+    scene = loaded()
+    image = manylights.render(scene, spp=9, seed=2).image
+    assert image.tobytes() == np.array(mi.render(scene.scene, spp=9, seed=2)).tobytes()
+
+
+def test_steps_have_the_samples_of_one_render(short_steps, llvm):
+    """Of a sampler with samples by index, whose pixels are then the same but for rounding."""
+    scene = loaded("one_light")
+    image = manylights.render(scene, spp=32).image
+    np.testing.assert_allclose(image, np.array(mi.render(scene.scene, spp=32)), rtol=1e-4)
+
+
+def test_integrators_of_mitsuba_have_the_samples_of_one_render(short_steps, llvm):
+    scene = loaded()
+    integrator = mi.load_dict({"type": "path"})
+    image = manylights.render(scene, spp=32, integrator=integrator).image
+    whole = np.array(mi.render(scene.scene, integrator=integrator, spp=32))
+    np.testing.assert_allclose(image, whole, rtol=1e-4)
+
+
+def test_other_samplers_have_a_sequence_for_each_step(llvm, monkeypatch):
+    """Few steps, each a render of its own; a note says so."""
+    monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
+    scene = loaded("aov", sampler="keep")
+    result = manylights.render(scene, spp=18, seed=3)
+    limits = Job.of(scene, spp=18).course.limits
+    sizes = [step.spp for step in plan.steps(18, limits)]
+    assert sizes == [4, 4, 4, 4, 2] and "no samples by index: 5 steps" in result.notes[-1]
+    expected = 0.0
+    for index, size in enumerate(sizes):
+        mi.render(scene.scene, seed=plan.seed_of(3, index), spp=size)
+        image = scene.scene.sensors()[0].film().bitmap()
+        expected = expected + np.array(image) * size / 18
+    np.testing.assert_allclose(np.array(result.bitmap), expected, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_nested_integrators_have_new_samples_in_each_step(short_steps, variant):
+    require_variant(variant)
+    scene = loaded("aov")
+    job = Job.of(scene, spp=16)
+    first, second = list(plan.steps(16, job.course.limits))[:2]
+    a, b = (job.driver.render(step, 0, 16, lambda done: None) for step in (first, second))
+    job.driver.end()
+    names = job.driver.channels()
+    for name in ("R", "depth.T"):
+        assert (a[..., names.index(name)] != b[..., names.index(name)]).mean() > 0.3
+
+
+def test_scene_is_left_as_it_was(short_steps, llvm):
+    scene = loaded()
+    before = np.array(mi.render(scene.scene, spp=8))
+    manylights.render(scene, spp=19, seed=5)
+    assert np.array(mi.render(scene.scene, spp=8)).tobytes() == before.tobytes()
+
+
+# ---------------------------------------------------------------------------------------- targets
+
+
+@pytest.fixture
+def few_pilots(monkeypatch, scalar):
+    """Renders of small images begin with few samples; scalar variants are fast there."""
+    monkeypatch.setattr(plan, "PILOT_SAMPLES", 2**13)
+
+
+def images_and_noises(scene, spp, seeds):
+    """Renders of so many samples, from four sequences, and the noise that each tells."""
+    results = [
+        manylights.render(scene, spp=spp, seed=seed, until_noise=1e-9, integrator=None)
+        for seed in seeds
+    ]
+    assert all(result.samples == spp for result in results)
+    return np.stack([result.image for result in results]), [result.noise for result in results]
+
+
+@pytest.mark.parametrize("name", ["many_bulbs", "interior", "points"])
+def test_noise_is_that_of_many_seeds(few_pilots, name):
+    images, noises = images_and_noises(loaded(name), 32, range(16))
+    mean = images.mean(axis=0)
+    truth = noise.noise(mean, images.var(axis=0, ddof=1))
+    assert np.all(np.abs(np.array(noises) / truth - 1.0) < 0.2), (truth, noises)
+
+
+def test_noise_of_parts_of_one_sequence_is_too_high(few_pilots):
+    """Why independent sequences are needed, and what the test above would find."""
+    scene = loaded("points")
+    images = tools.render_seeds(scene.scene, spp=32)
+    truth = noise.noise(images.mean(axis=0), images.var(axis=0, ddof=1))
+    job = Job.of(scene, spp=32)
+    parts = [
+        job.driver.render(plan.Step.of([plan.Pass(first, 8)]), 0, 32, lambda done: None)
+        for first in range(0, 32, 8)
+    ]
+    job.driver.end()
+    colors = np.stack([part[..., :3] / part[..., 3:] for part in parts])
+    weights = np.full(4, 0.25)
+    wrong = noise.noise(colors.mean(axis=0), noise.variance_of_mean(colors, weights))
+    assert wrong > 1.2 * truth, (wrong, truth)
+
+
+def test_variance_is_that_of_the_image(few_pilots):
+    """Its mean over the pixels, and that of the images of many seeds."""
+    scene = loaded("points")
+    results = [manylights.render(scene, spp=32, seed=seed, until_noise=1e-9) for seed in range(16)]
+    images = np.stack([result.image for result in results])
+    expected = images.var(axis=0, ddof=1).mean()
+    found = np.mean([result.variance.mean() for result in results])
+    assert results[0].variance.shape == images[0].shape
+    assert found == pytest.approx(expected, rel=0.15)
+
+
+@pytest.mark.parametrize(("name", "asked"), [("many_bulbs", 0.1), ("interior", 0.1), ("fog", 0.07)])
+def test_noise_asked_for_is_reached(few_pilots, name, asked):
+    scene = loaded(name)
+    for seed in range(2):
+        result = manylights.render(scene, seed=seed, until_noise=asked)
+        assert 0.75 * asked < result.noise < 1.15 * asked
+
+
+def test_mean_of_renders_until_a_noise_has_no_bias(few_pilots):
+    """How many samples there are depends on them; a bias of two percent would be found."""
+    scene = loaded("points", 16, 10, filter_type="box")
+    results = [manylights.render(scene, seed=s, until_noise=0.02) for s in range(100, 132)]
+    assert len({result.samples for result in results}) > 1
+    images = np.stack([result.image for result in results])
+    reference = tools.render_seeds(scene.scene, spp=256, seeds=range(8))
+    tools.assert_same_mean(images, reference)
+    with pytest.raises(AssertionError):
+        tools.assert_same_mean(images * 1.02, reference)
+
+
+def test_target_out_of_reach_says_what_was_reached(few_pilots):
+    result = manylights.render(loaded(), spp=17, until_noise=1e-4)
+    assert result.samples == 16
+    assert f"{result.noise:.3g} was reached and not 0.0001, with 16 samples" in result.notes[-1]
+    single = manylights.render(loaded(), spp=1, until_noise=0.1)
+    assert single.noise is None and "too few" in single.notes[-1]
+
+
+def test_renders_without_a_target_do_not_know_their_noise(few_pilots):
+    result = manylights.render(loaded(), spp=4)
+    assert result.noise is None and result.variance is None and result.samples == 4
+
+
+def test_time_is_kept(scalar):
+    scene = loaded()
+    manylights.render(scene, spp=8)
+    start = time.perf_counter()
+    result = manylights.render(scene, seconds=1.0)
+    assert 0.7 < result.seconds < 1.5 and time.perf_counter() - start < 2.5
+    assert result.samples > 16 and result.noise > 0.0
+    assert manylights.render(scene, seconds=1e6, spp=8).samples == 8
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_interrupted_targets_go_on_to_the_same_bits(monkeypatch, tmp_path, variant):
+    """The same decisions: how many samples there are depends on the sums alone."""
+    require_variant(variant)
+    monkeypatch.setattr(plan, "PILOT_SAMPLES", 2**13)
+    scene, target = loaded("interior"), 0.15
+    whole = manylights.render(scene, until_noise=target)
+    path = tmp_path / "state.exr"
+    options = {"until_noise": target, "checkpoint": path, "checkpoint_seconds": 1e-9}
+    for steps in (1, 2, 3):
+        calls = []
+
+        def stop(progress, calls=calls, steps=steps):
+            calls.append(progress.samples)
+            if len(set(calls)) > steps:
+                raise InterruptedError
+
+        with pytest.raises(InterruptedError):
+            manylights.render(scene, progress=stop, **options)
+        assert path.exists()
+    result = manylights.render(scene, **options)
+    assert result.image.tobytes() == whole.image.tobytes()
+    assert (result.samples, result.noise) == (whole.samples, whole.noise)
+    assert not path.exists()
+
+
+def test_command_writes_the_noise_into_the_file(few_pilots, tmp_path, capsys):
+    out = tmp_path / "out.exr"
+    arguments = ["render", str(SCENES / "points.xml"), "-o", str(out), "--variant", "scalar_rgb"]
+    arguments += ["-D", "resx=32", "-D", "resy=20", "--until-noise", "0.1", "--spp", "256"]
+    assert cli.main(arguments) == 0
+    noise_in_file = json.loads(mi.Bitmap(str(out)).metadata()["manylights.noise"])
+    assert 0.05 < noise_in_file < 0.15
+    assert f"noise {noise_in_file:.3g}, wrote" in capsys.readouterr().err
+
+
+# ----------------------------------------------------------------------------------------- inputs
+
+
+def test_scenes_of_all_kinds_are_the_same(scalar):
+    path = SCENES / "points.xml"
+    by_path = manylights.render(path, spp=2)
+    assert any("independent replaced by manylights_sobol" in note for note in by_path.notes)
+    assert manylights.render(str(path), spp=2).image.tobytes() == by_path.image.tobytes()
+    scene = loading.load(str(path))
+    assert manylights.render(scene, spp=2).image.tobytes() == by_path.image.tobytes()
+    assert manylights.render(scene.scene, spp=2).image.tobytes() == by_path.image.tobytes()
+
+
+def test_dictionaries_are_rendered_with_our_integrator_and_sampler(scalar):
+    description = {**mi.cornell_box()}
+    result = manylights.render(description, spp=2)
+    assert "path replaced by manylights_volpath" in " ".join(result.notes)
+    assert "replaced by manylights_sobol" in " ".join(result.notes)
+    kept = manylights.render(description, spp=2, integrator="keep")
+    assert "path replaced" not in " ".join(kept.notes)
+    assert result.image.shape == (256, 256, 3) and result.image.mean() > 0.0
+
+
+def test_integrators_are_chosen_in_all_ways(scalar):
+    path, scene = SCENES / "points.xml", loaded("points", sampler="keep", filter_type="box").scene
+    for wanted in ("depth", {"type": "depth"}, mi.load_dict({"type": "depth"})):
+        for source in (scene, path):
+            image = manylights.render(source, spp=1, integrator=wanted).image
+            assert image.max() > 1.0 and np.ptp(image, axis=2).max() == 0.0
+
+
+def test_progress_is_told(short_steps, llvm, tmp_path):
+    seen = []
+    options = {"checkpoint": tmp_path / "state.exr", "checkpoint_seconds": 1e-9}
+    result = manylights.render(loaded(), spp=16, progress=seen.append, **options)
+    fractions = [progress.fraction for progress in seen]
+    assert fractions[0] == 0.0 and fractions[-1] == 1.0 and fractions == sorted(fractions)
+    assert seen[-1].samples == result.samples == 16
+    assert "has 12 of 16 samples per pixel" in seen[-1].kept
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"spp": 0}, "spp 0: must be 1 to"),
+        ({"seed": -1}, "seed -1: must be 0 to"),
+        ({"sensor": 1}, "sensor 1: must be 0 to 0"),
+        ({"until_noise": 0.0}, "until_noise 0.0: must be a number above 0"),
+        ({"until_noise": float("nan")}, "until_noise nan"),
+        ({"seconds": float("inf")}, "seconds inf"),
+        ({"threads": 0}, "threads 0"),
+        ({"integrator": 3}, "integrator 3: must be a name"),
+        ({"checkpoint": "state.png"}, "checkpoint state.png: it is an OpenEXR file"),
+        ({"checkpoint": "no/state.exr"}, "checkpoint no/state.exr: there is no folder no"),
+        ({"checkpoint": "state.exr", "checkpoint_seconds": 0}, "checkpoint_seconds 0"),
+        ({"output": "image.png"}, "image.png"),
+    ],
+)
+def test_bad_arguments_are_named(scalar, options, words):
+    with pytest.raises(ValueError) as raised:
+        manylights.render(loaded(), **options)
+    assert words in str(raised.value)
+
+
+def test_bad_scenes_are_named(scalar, tmp_path):
+    with pytest.raises(UsageError, match=r"no\.xml: no such file"):
+        manylights.render(tmp_path / "no.xml")
+    with pytest.raises(UsageError, match="scene 3: must be a path"):
+        manylights.render(3)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--until-noise", v) for v in ("0", "-1", "nan", "inf", "little")]
+    + [("--for", v) for v in ("0", "-1m", "nan", "10d", "m", "soon")],
+)
+def test_bad_targets_are_named(capsys, option, value):
+    with pytest.raises(SystemExit) as raised:
+        cli.main(["render", "scene.xml", "-o", "out.exr", f"{option}={value}"])
+    assert raised.value.code == 2
+    message = capsys.readouterr().err
+    assert option in message and value in message
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("60", 60), ("60s", 60), ("1.5m", 90), ("2h", 7200)])
+def test_times_have_units(text, seconds):
+    assert cli.options.duration(text) == seconds
+
+
+# --------------------------------------------------------------------------------------- samplers
+
+
+SENSOR = '<sensor type="perspective"><film type="hdrfilm"/>{}</sensor>'
+
+
+def chosen(tmp_path, text, wanted=None):
+    """Choose the samplers of XML; returns the plugin's name, its parameters, and the log."""
+    mi.set_variant("scalar_rgb")
+    path = tmp_path / "chosen.xml"
+    path.write_text(f'<scene version="3.0.0">{SENSOR.format(text)}</scene>')
+    parsed = loading.parse(str(path))
+    notes = samplers.choose(parsed.state, wanted)
+    nodes = [node for node in parsed.state.nodes if node.type == mi.ObjectType.Sampler]
+    loading.instantiate(parsed)
+    if not nodes:
+        return None, {}, notes
+    return nodes[0].props.plugin_name(), dict(nodes[0].props.items()), notes
+
+
+def sampler(kind):
+    """A sampler as XML."""
+    return f'<sampler type="{kind}"><integer name="sample_count" value="16"/></sampler>'
+
+
+def test_independent_is_replaced_with_its_count(tmp_path):
+    name, parameters, notes = chosen(tmp_path, sampler("independent"))
+    assert (name, parameters) == ("manylights_sobol", {"sample_count": 16})
+    assert notes == ["sampler: independent replaced by manylights_sobol (--sampler keep undoes it)"]
+
+
+def test_sensor_without_sampler_gets_ours(tmp_path):
+    assert chosen(tmp_path, "")[0] == "manylights_sobol"
+
+
+@pytest.mark.parametrize("kind", ["multijitter", "stratified", "manylights_sobol"])
+def test_other_samplers_stay(tmp_path, kind):
+    assert chosen(tmp_path, sampler(kind)) == (kind, {"sample_count": 16}, [])
+
+
+def test_samplers_can_be_kept_or_named(tmp_path):
+    assert chosen(tmp_path, sampler("independent"), "keep")[::2] == ("independent", [])
+    jittered = sampler("multijitter").replace("</s", '<boolean name="jitter" value="false"/></s')
+    name, parameters, notes = chosen(tmp_path, jittered, "independent")
+    assert (name, parameters) == ("independent", {"sample_count": 16})
+    assert notes == ["sampler: multijitter replaced by independent"]
