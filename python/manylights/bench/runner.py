@@ -228,7 +228,7 @@ class SceneRun:
     def _calibrate_all(self) -> list[Candidate]:
         candidates = []
         for method in self.task.methods:
-            why = self._impossible(method)
+            why = _impossible(method, self.loaded.lights, self.weights)
             if why:
                 self._skip(method, why)
             else:
@@ -244,15 +244,6 @@ class SceneRun:
                 if self._attempt(candidate, self._calibrate) and candidate.times:
                     candidates.append(candidate)
         return candidates
-
-    def _impossible(self, method: Method) -> str | None:
-        """Return why a method makes no sense for this scene, None if it does."""
-        lights = self.loaded.lights
-        if method.name == "exhaustive" and lights > EXHAUSTIVE_LIGHTS:
-            return f"{lights:,} lights: more than {EXHAUSTIVE_LIGHTS:,}"
-        if method.name == "power" and np.ptp(self.weights) < 1e-4:
-            return "all emitters have the same power: the same as uniform"
-        return None
 
     def _calibrate(self, candidate: Candidate) -> None:
         """Find the numbers of samples of a method, and its times; without any it is too slow."""
@@ -276,29 +267,14 @@ class SceneRun:
             wanted = list(candidate.times)
         self._check_samples(wanted)
         if not series["points"]:
-            self._choose_sampler(candidate, wanted)
+            chosen = _choose_sampler(self._draw, self.loaded.sensors, candidate)
+            say(f"{self.entry['name']}: {candidate.method.spec} with {chosen}")
             series["first_seconds"] = first.seconds
             series["build_seconds"] = _build_seconds(candidate)
         missing = [spp for spp in wanted if spp not in candidate.spps]
         series["points"] = sorted(
             [*series["points"], *map(records.new_point, missing)], key=lambda point: point["spp"]
         )
-
-    def _choose_sampler(self, candidate: Candidate, wanted: list[int]) -> None:
-        """Give Mitsuba's integrators the best of Mitsuba's samplers."""
-        if candidate.method.is_ours:
-            return
-
-        def render(sampler: str, spp: int, number: int) -> Drawing:
-            candidate.series["sampler"] = sampler
-            return self._draw(candidate, spp, CALIBRATION_SEED + 2 + number)
-
-        chosen = samplers.choose(self.loaded.sensors, wanted, render)
-        candidate.series["sampler"] = chosen
-        candidate.times = {
-            spp: self._draw(candidate, spp, CALIBRATION_SEED).seconds for spp in candidate.times
-        }
-        say(f"{self.entry['name']}: {candidate.method.spec} with {chosen}")
 
     def _largest(self) -> int | None:
         """Return the largest number of samples that the reference is good for, None if any."""
@@ -459,6 +435,34 @@ class SceneRun:
         counting = mi.load_dict({**description, "counts": True})
         maps = draw_channels(self.loaded, counting, MAP_SAMPLES, CALIBRATION_SEED, channels.WORK)
         self.found.write_image(self.entry["name"], name, maps, channels.WORK)
+
+
+def _impossible(method: Method, lights: int, weights: np.ndarray) -> str | None:
+    """Return why a method makes no sense for a scene, None if it does."""
+    if method.name == "exhaustive" and lights > EXHAUSTIVE_LIGHTS:
+        return f"{lights:,} lights: more than {EXHAUSTIVE_LIGHTS:,}"
+    if method.name == "power" and np.ptp(weights) < 1e-4:
+        return "all emitters have the same power: the same as uniform"
+    return None
+
+
+def _choose_sampler(
+    draw: Callable[[Candidate, int, int], Drawing], sensors: dict[str, Any], candidate: Candidate
+) -> str:
+    """Give Mitsuba's integrators the best of Mitsuba's samplers; return the name of the sampler."""
+    if candidate.method.is_ours:
+        return candidate.sampler
+
+    def render(sampler: str, spp: int, number: int) -> Drawing:
+        candidate.series["sampler"] = sampler
+        return draw(candidate, spp, CALIBRATION_SEED + 2 + number)
+
+    chosen = samplers.choose(sensors, list(candidate.times), render)
+    candidate.series["sampler"] = chosen
+    candidate.times = {
+        spp: draw(candidate, spp, CALIBRATION_SEED).seconds for spp in candidate.times
+    }
+    return chosen
 
 
 def _build_seconds(candidate: Candidate) -> float:
