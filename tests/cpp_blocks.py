@@ -12,7 +12,8 @@ NO_CODE = re.compile(
     r"|^[ \t]*#(?:[^\n]*\\\n)*[^\n]*",
     re.S | re.M,
 )
-LABEL = re.compile(r"\b(?:public|private|protected):")
+#: Labels, and macros that stand in a line of their own like Mitsuba's NAMESPACE_BEGIN(mitsuba).
+LABEL = re.compile(r"\b(?:public|private|protected):|^[A-Z_]+\(\w+\)$", re.M)
 TOKEN = re.compile(r"[{};()\n]|[^{};()\n]+")
 CLASS = re.compile(r"\b(?:class|struct|union)\s+(?:alignas\(\d+\)\s*)?(\w+)")
 CONTROL = re.compile(r"(?:if|else|for|while|switch|do|try|catch)\b")

@@ -20,12 +20,15 @@ def tables():
 
 
 def documented(text):
-    """Type and text of the parameters in a documentation block, without read-only ones."""
+    """Type and text of the parameters in a documentation block.
+
+    Without what only `mi.traverse` has: that has no default.
+    """
     block = text[text.index(".. pluginparameters::") :]
     return {
         name: (kind, " ".join(about.split()))
         for name, kind, about in BULLET.findall(block)
-        if "read-only" not in about
+        if "Default:" in about
     }
 
 
