@@ -110,7 +110,7 @@ def test_integrators_of_mitsuba_have_the_samples_of_one_render(short_steps, llvm
 def test_other_samplers_have_a_sequence_for_each_step(llvm, monkeypatch):
     """Few steps, each a render of its own; a note says so."""
     monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
-    scene = loaded("aov", sampler="keep")
+    scene = loaded("aov", sampler="keep", filter_type="box")
     result = manylights.render(scene, spp=18, seed=3)
     limits = Job.of(scene, spp=18).course.limits
     sizes = [step.spp for step in plan.steps(18, limits)]
@@ -379,11 +379,11 @@ def chosen(tmp_path, text, wanted=None):
     path.write_text(f'<scene version="3.0.0">{SENSOR.format(text)}</scene>')
     parsed = loading.parse(str(path))
     notes = samplers.choose(parsed.state, wanted)
-    nodes = [node for node in parsed.state.nodes if node.type == mi.ObjectType.Sampler]
-    loading.instantiate(parsed)
-    if not nodes:
-        return None, {}, notes
-    return nodes[0].props.plugin_name(), dict(nodes[0].props.items()), notes
+    nodes = (node for node in parsed.state.nodes if node.type == mi.ObjectType.Sampler)
+    found = [(node.props.plugin_name(), dict(node.props.items())) for node in nodes]
+    with loading.search_beside(str(path)):
+        loading.instantiate(parsed)
+    return (*found[0], notes)
 
 
 def sampler(kind):

@@ -176,7 +176,7 @@ def _show(title: str, state: Bar, worker: threading.Thread) -> None:
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=24),
         TaskProgressColumn(),
         TextColumn("{task.fields[left]} left {task.fields[text]}"),
     )
