@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from manylights import files
-from manylights.output import channels
+from manylights.output import channels, exr
 from manylights.threads import threads_for_files
 
 
@@ -21,16 +24,35 @@ def check_output(path: str) -> Path:
     return files.check_output(path, "the image is an OpenEXR file", ".exr")
 
 
-def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
+def write_images(
+    bitmap,
+    target: Path,
+    layers: Mapping[str, np.ndarray] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+    number: type = np.float32,
+) -> tuple[list[Path], list[str]]:
     """Write ``bitmap`` as EXR to ``target`` and as PNG (8 bits, sRGB) beside it.
 
     Each file is written under another name first and then renamed, so it is there whole or not
     at all.
 
+    Args:
+        bitmap: the image.
+        target: the EXR file.
+        layers: further channels by name, shape (height, width) each. Default: none.
+        attributes: of the EXR file (``exr.write``). Default: none.
+        number: of the image's channels in the file (``number_of``).
+
     Returns:
-        The written files, and lines for the log about what could not be written.
+        The written files, and lines for the log about what could not be written as it is.
     """
-    written, notes = [write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)], []
+    exact = np.array(bitmap)
+    exact = exact.reshape(*exact.shape[:2], -1)
+    with np.errstate(over="ignore"):
+        pixels = exact.astype(number)
+    planes = {name: pixels[..., index] for index, name in enumerate(channels.names(bitmap))}
+    written = [exr.write(target, {**planes, **(layers or {})}, attributes or {})]
+    notes = _overflows(exact, pixels)
     preview = _preview(bitmap)
     if preview is None:
         notes.append("preview: the film has no colour channels, no PNG written")
@@ -38,6 +60,21 @@ def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
         file_format = mi.Bitmap.FileFormat.PNG
         written.append(write_whole(preview, target.with_suffix(".png"), file_format))
     return written, notes
+
+
+def number_of(film) -> type:
+    """Return the numbers that a film of Mitsuba writes: single precision if it does not say."""
+    halves = re.search(r"component_format = float16\b", str(film))
+    return np.float16 if halves else np.float32
+
+
+def _overflows(exact: np.ndarray, written: np.ndarray) -> list[str]:
+    """Return a line about numbers that became infinite."""
+    count = int((np.isinf(written) & np.isfinite(exact)).sum())
+    if not count:
+        return []
+    remedy = 'give the film <string name="component_format" value="float32"/>'
+    return [f"{count} values exceed 65504, the largest in 16 bits, and are infinite: {remedy}"]
 
 
 def exposed(bitmap, factor: float):

@@ -6,7 +6,6 @@ from four independent images that are rendered in turn.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,8 +15,9 @@ import numpy as np
 
 from manylights import loading
 from manylights.errors import UsageError
-from manylights.output import images
-from manylights.rendering.checkpoint import ATTRIBUTE, Checkpoint
+from manylights.output import channels, images
+from manylights.rendering import metadata
+from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
 from manylights.rendering.job import Job, check
 from manylights.rendering.state import State
@@ -50,7 +50,7 @@ class RenderResult:
     Attributes:
         image: shape (height, width, channels), single precision, as ``mi.render`` returns it,
             multiplied by the exposure of a USD camera.
-        bitmap: the same as ``mi.Bitmap``, with names and the number format that the film asks for.
+        bitmap: the same as ``mi.Bitmap``, with names; the file has the film's number format.
         variance: of each pixel's mean, shape (height, width, colours), in squared units of the
             image; None if it is not known: only renders with a target find it.
         noise: the root of the mean relative variance of the pixels, without the largest 0.1 % of
@@ -130,11 +130,23 @@ def render(
 def _finished(job: Job, state: State, store: Checkpoint | None, target: Path | None):
     result = result_of(job, state)
     if target is not None:
-        result.files, notes = images.write_images(result.bitmap, target)
+        layers = variance_layers(result)
+        attributes = metadata.attributes(job, result)
+        number = images.number_of(job.film)
+        result.files, notes = images.write_images(result.bitmap, target, layers, attributes, number)
         result.notes += notes
     if store is not None:
         store.remove()
     return result
+
+
+def variance_layers(result: RenderResult) -> dict[str, np.ndarray]:
+    """Return the channels ``variance.*``, where the variance is known."""
+    if result.variance is None:
+        return {}
+    names = channels.RGB if result.variance.shape[2] == 3 else ("Y",)
+    planes = np.moveaxis(result.variance, 2, 0).astype(np.float32)
+    return {f"variance.{name}": plane for name, plane in zip(names, planes)}
 
 
 def _store(path: str | Path, job: Job, seconds: float) -> Checkpoint:
@@ -194,8 +206,6 @@ def result_of(job: Job, state: State) -> RenderResult:
     image, bitmap = develop(job.film, state.total(driver.adjoint), exposure)
     spread = state.spread(driver.adjoint)
     noise = None if spread is None else spread.noise
-    if noise is not None:
-        bitmap.metadata()[ATTRIBUTE + "noise"] = json.dumps(noise)
     variance = None if spread is None else spread.variance * np.float32(exposure**2)
     history, notes = state.history, job.loaded.notes + job.notes(state.history, noise)
     return RenderResult(image, bitmap, variance, noise, history.spp, history.seconds, notes)

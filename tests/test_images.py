@@ -1,0 +1,162 @@
+"""Files that renders leave: channels and attributes, as other programs read them, too."""
+
+import manylights
+import mitsuba as mi
+import numpy as np
+import pytest
+from manylights import cli, files
+from manylights.errors import UsageError
+from manylights.output import exr, images
+from manylights.rendering import metadata
+
+from tests.conftest import require_variant
+
+pytestmark = pytest.mark.usefixtures("plugin", "scalar")
+
+
+@pytest.fixture
+def scalar():
+    return require_variant("scalar_rgb")
+
+
+@pytest.fixture
+def planes():
+    """Channels of all number formats; rows and columns differ in number."""
+    generator = np.random.default_rng(1)
+    values = {name: generator.random((5, 7)) for name in ("R", "G", "B", "Z", "normal.X")}
+    halves = {name: values[name].astype(np.float16) for name in ("R", "G", "B")}
+    data = {name: values[name].astype(np.float32) for name in ("Z", "normal.X")}
+    return {**halves, **data, "samples": np.full((5, 7), 4096, np.uint32)}
+
+
+def scene(**camera):
+    """A lamp above a floor, with a film whose format is that of `camera`."""
+    to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0.2, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float16"}
+    return {
+        "type": "scene",
+        "floor": {"type": "rectangle"},
+        "lamp": {"type": "point", "position": [0, 0, 1], "intensity": camera.pop("intensity", 1.0)},
+        "camera": {"type": "perspective", "fov": 50, "to_world": to_world, "film": film, **camera},
+    }
+
+
+# --------------------------------------------------------------------------------- channels
+
+
+def test_channels_and_attributes_come_back(planes, tmp_path):
+    path = tmp_path / "a.exr"
+    told = {"manylights.noise": 0.25, "manylights.seed": 3, "manylights.files": {"a": "1"}}
+    exr.write(path, planes, {**told, "chromaticities": metadata.CHROMATICITIES})
+    found, attributes = exr.read(path)
+    assert set(found) == set(planes)
+    for name, plane in planes.items():
+        assert found[name].dtype == plane.dtype and (found[name] == plane).all(), name
+    assert attributes["manylights.noise"] == 0.25 and attributes["manylights.seed"] == 3
+    assert attributes["manylights.files"] == '{"a": "1"}'
+    assert attributes["chromaticities"] == pytest.approx(metadata.CHROMATICITIES)
+    names, size, header = exr.read_header(path)
+    assert set(names) == set(planes) and size == (7, 5) and header["manylights.seed"] == 3
+
+
+def test_mitsuba_reads_the_channels(planes, tmp_path):
+    bitmap = mi.Bitmap(str(exr.write(tmp_path / "a.exr", planes, {"manylights.seed": 3})))
+    pixels = np.array(bitmap)
+    for index, field in enumerate(bitmap.struct_()):
+        # Mitsuba reads all channels in the number format of the first one
+        assert pixels[..., index] == pytest.approx(planes[field.name].astype(float), rel=1e-3)
+
+
+def test_openimageio_reads_the_channels(planes, tmp_path):
+    oiio = pytest.importorskip("OpenImageIO")
+    path = exr.write(tmp_path / "a.exr", planes, {"manylights.noise": 0.25})
+    image = oiio.ImageBuf(str(path))
+    assert image.spec().getattribute("manylights.noise") == 0.25
+    pixels = image.get_pixels(oiio.FLOAT)
+    for index, name in enumerate(image.spec().channelnames):
+        # It takes the largest integer for 1
+        scale = 2**32 - 1 if planes[name].dtype == np.uint32 else 1
+        assert pixels[..., index] * scale == pytest.approx(planes[name].astype(float)), name
+
+
+@pytest.mark.parametrize("content", [b"", b"no image", "half"])
+def test_files_that_are_no_images_are_named(content, planes, tmp_path):
+    path = tmp_path / "a.exr"
+    if content == "half":
+        exr.write(path, planes, {})
+        content = path.read_bytes()[: path.stat().st_size // 2]
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match=r"a\.exr: not a whole OpenEXR image"):
+        exr.read(path)
+
+
+def test_a_file_that_cannot_be_written_leaves_the_one_before(planes, tmp_path, monkeypatch):
+    path = exr.write(tmp_path / "a.exr", planes, {})
+    before = path.read_bytes()
+
+    def no_space(partial):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files, "_flush", no_space)
+    with pytest.raises(UsageError, match="No space left"):
+        exr.write(path, planes, {"manylights.seed": 1})
+    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+# ----------------------------------------------------------------------------------- renders
+
+
+def test_a_render_says_how_it_was_made(tmp_path, capsys):
+    path = tmp_path / "a.exr"
+    result = manylights.render(scene(), spp=256, until_noise=0.5, output=path, seed=2**32 - 1)
+    planes, attributes = exr.read(path)
+    assert attributes["manylights.samples"] == result.samples
+    assert attributes["manylights.noise"] == pytest.approx(result.noise)
+    assert attributes["manylights.seed"] == str(2**32 - 1)  # an OpenEXR integer has 31 bits
+    assert "shadow_rays = 4" in attributes["manylights.integrator"]
+    for index, name in enumerate("RGB"):
+        assert planes[name].dtype == np.float16
+        assert (planes[f"variance.{name}"] == result.variance[..., index]).all()
+    assert cli.main(["info", str(path)]) == 0
+    told = capsys.readouterr().out
+    for text in ("16 x 12", "variance.R", "shadow_rays = 4", "scalar_rgb", "worldToNDC"):
+        assert text in told
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
+def test_ndc_of_a_point_is_where_the_camera_sees_it(kind):
+    crop = {"crop_width": 8, "crop_height": 5, "crop_offset_x": 3, "crop_offset_y": 2}
+    film = {"type": "hdrfilm", "width": 16, "height": 12, **crop}
+    lens = {"aperture_radius": 1e-6, "focus_distance": 3.0}
+    only = {"perspective": {"principal_point_offset_x": 0.1}, "thinlens": lens}[kind]
+    sensor = mi.load_dict(scene(type=kind, film=film, **only)).sensors()[0]
+    matrix = metadata.camera_matrices(sensor)["worldToNDC"]
+    place = np.array([0.1, 0.3, -0.2])
+    x, y, _, w = np.append(place, 1) @ matrix
+    ray, _ = sensor.sample_ray(0, 0.5, [x / w, y / w], [0.5, 0.5])
+    towards = place - np.array(ray.o).ravel()
+    assert np.array(ray.d).ravel() == pytest.approx(towards / np.linalg.norm(towards), abs=1e-5)
+
+
+def test_halves_that_overflow_are_reported(tmp_path):
+    bright = manylights.render(scene(intensity=1e7), spp=1, output=tmp_path / "a.exr")
+    assert any("65504" in note and "component_format" in note for note in bright.notes)
+    film = {"type": "hdrfilm", "width": 16, "height": 12, "component_format": "float32"}
+    fine = manylights.render(scene(intensity=1e7, film=film), spp=1, output=tmp_path / "a.exr")
+    assert not any("65504" in note for note in fine.notes)
+
+
+def test_info_names_files_of_others(tmp_path, capsys):
+    path = tmp_path / "other.exr"
+    mi.Bitmap(np.zeros((4, 4, 3), np.float32)).write(str(path))
+    assert cli.main(["info", str(path)]) == 2
+    assert cli.main(["info", str(tmp_path / "none.exr")]) == 2
+    told = capsys.readouterr().err
+    assert "other.exr: no render of manylights" in told and "none.exr: no such file" in told
+
+
+def test_images_without_a_name_for_layers_are_as_before(tmp_path):
+    bitmap = mi.Bitmap(np.ones((4, 4, 3), np.float32))
+    written, notes = images.write_images(bitmap, tmp_path / "a.exr")
+    assert [path.name for path in written] == ["a.exr", "a.png"] and not notes
+    assert (np.array(mi.Bitmap(str(written[0]))) == 1).all()
