@@ -11,6 +11,7 @@
 #include "manylights/scene/scene_lights.h"
 #include "pass_plan.h"
 #include "passes.h"
+#include <cmath>
 #include <mitsuba/render/sensor.h>
 
 namespace manylights {
@@ -148,7 +149,11 @@ private:
             else
                 result.camera[i] = (float) camera.entry(i);
         }
-        result.scene = (float) dr::norm(scene->bbox().extents());
+        // In double precision, where squares of all units fit; places without sense do not count
+        double diagonal = 0;
+        for (double extent : scene->bbox().extents())
+            diagonal += std::isfinite(extent) ? extent * extent : 0;
+        result.scene = (float) std::sqrt(diagonal);
         return result;
     }
 
