@@ -99,8 +99,8 @@ private:
             si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
             plain(s.depth == 0u), m_media ? surface || piece.inside.here : surface);
         add_direct_light(s, vertex, piece, surface && !piece.hidden);
-        scatter(s, vertex, piece);
-        play_roulette(s);
+        Float roulette = scatter(s, vertex, piece);
+        play_roulette(s, roulette);
         intersect(s, /* coherent = */ false);
         if (m_media)
             start_at(s, si.p, !piece.scattered);
@@ -175,8 +175,12 @@ private:
     // ----------------------------------------------------------------------- Scattering
 
     /// Continue in a direction sampled from the BSDF or the phase function
-    void scatter(State &s, const Vertex &vertex, const Piece &piece) const {
-        Float u1       = s.sampler->next_1d(s.active);
+    /// Returns the number that Russian roulette is played with
+    Float scatter(State &s, const Vertex &vertex, const Piece &piece) const {
+        Float u1 = s.sampler->next_1d(s.active), roulette(0.f);
+        // Drawn here: a vertex has eight numbers, and manylights_sobol has sequences of four
+        if (m_limits.rr_depth < m_limits.max_depth)
+            roulette = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
         Mask surface   = s.active && !piece.scattered;
         Direction next = m_media ? m_scattering.sample_either(s, vertex, piece, u1, u2)
@@ -196,6 +200,7 @@ private:
                 m_direct.media().medium_beyond(vertex.si, s.medium, next.ray.d, surface);
         }
         s.ray = next.ray;
+        return roulette;
     }
 
     /// Rays start a little off their surface, pieces in media do not
@@ -243,12 +248,12 @@ private:
         return surface;
     }
 
-    void play_roulette(State &s) const {
+    void play_roulette(State &s, const Float &u) const {
         Float most = dr::max(mitsuba::unpolarized_spectrum(s.throughput));
         s.active &= most != 0.f;
         Float go_on = dr::detach(dr::minimum(most * dr::square(s.eta), .95f));
         Mask plays  = s.depth >= m_limits.rr_depth;
-        s.active &= !plays || s.sampler->next_1d(s.active) < go_on;
+        s.active &= !plays || u < go_on;
         dr::masked(s.throughput, plays) = s.throughput * dr::rcp(go_on);
     }
 
