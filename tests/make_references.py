@@ -55,7 +55,8 @@ def scene_names():
 def load_scene(name, integrator="keep"):
     """Load a scene with the size of the references, and another integrator if one is named."""
     size = {"resx": str(WIDTH), "resy": str(HEIGHT)}
-    return loading.load(str(SCENE_FOLDER / f"{name}.xml"), size, integrator).scene
+    path = str(SCENE_FOLDER / f"{name}.xml")
+    return loading.load(path, size, integrator, sampler="keep").scene
 
 
 def load_without_area_lights(name):
