@@ -108,16 +108,15 @@ private:
             dr::sync_thread();
         dr::eval();
         m_has_part = true;
-        Sums(m_film, m_size, pixels).add(result, rows(pass, first, count));
+        Sums(m_film, m_size, pixels).add(result, rows(pass, pixels, first, count));
     }
 
     /// Those that numbers of a set of pixels are in
-    std::pair<uint32_t, uint32_t> rows(const Pass &pass, uint32_t first,
-                                       uint32_t count) const {
-        uint32_t side    = pass.plan.role == Role::Train ? Pixels::kSide : 1,
-                 columns = (m_size.x() + side - 1) / side;
-        return { first / columns * side,
-                 std::min(((first + count - 1) / columns + 1) * side, m_size.y()) };
+    std::pair<uint32_t, uint32_t> rows(const Pass &pass, const Pixels &pixels,
+                                       uint32_t first, uint32_t count) const {
+        uint32_t side = pass.plan.role == Role::All ? 1 : Pixels::kSide;
+        return { pixels.row(first),
+                 std::min(pixels.row(first + count - 1) + side, m_size.y()) };
     }
 
     /// Where gradients are wanted
@@ -147,8 +146,7 @@ private:
         if (!pass.sampler.pattern && first > 0)
             seed = mitsuba::sample_tea_32(seed, UInt32(first), 6).first;
         // A pattern depends on the number of a pixel's first lane: to be that of all samples
-        bool whole =
-            samples == m_sampler->sample_count() && pass.plan.role != Role::Train;
+        bool whole = samples == m_sampler->sample_count() && pass.plan.role == Role::All;
         if (pass.sampler.pattern && whole)
             seed += first * samples;
         else if (pass.sampler.pattern)
