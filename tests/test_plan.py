@@ -67,6 +67,15 @@ def test_passes_have_every_sample_of_every_pixel_once(spp):
         assert covered == {"sixteenth": list(range(spp)), "others": list(range(spp))}
 
 
+@pytest.mark.parametrize("spp", [1, 2, 3, 16, 100, 1000])
+@pytest.mark.parametrize("pixels", [*SIZES, 15, 16, 17, 1000, 2**21, 2**21 + 16])
+def test_integrators_make_the_same_passes(spp, pixels):
+    """What they train with where there is no plan, and what plans train with, is one rule."""
+    core = pytest.importorskip("manylights._core")
+    expected = [(one.first, one.count, one.role) for one in plan.passes(0, spp, Limits(pixels))]
+    assert core.learning_passes(spp, pixels) == expected
+
+
 def test_training_comes_first_and_once():
     for limits in all_limits():
         roles = [one.role for step in plan.steps(64, limits) for one in step.passes]

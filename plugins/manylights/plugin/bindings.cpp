@@ -10,10 +10,12 @@
 #include "manylights/choice/splitting.h"
 #include "manylights/choice/systematic.h"
 #include "manylights/emission/brightness_map.h"
+#include "manylights/render/pass_plan.h"
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 namespace nb = nanobind;
@@ -301,6 +303,16 @@ nb::list parameters(const std::string &plugin) {
     return result;
 }
 
+std::vector<std::tuple<uint32_t, uint32_t, uint32_t>> learning_passes(uint32_t spp,
+                                                                      uint64_t pixels) {
+    if (spp == 0 || pixels == 0)
+        throw nb::value_error("spp and pixels must be at least 1");
+    std::vector<std::tuple<uint32_t, uint32_t, uint32_t>> result;
+    for (const PlannedPass &pass : PassPlan::learning(spp, pixels, /* divides = */ false))
+        result.emplace_back(pass.first, pass.count, (uint32_t) pass.role);
+    return result;
+}
+
 } // namespace
 
 NB_MODULE(_core, m) {
@@ -353,6 +365,8 @@ NB_MODULE(_core, m) {
     m.def("select", &select_items, "targets"_a, "picks"_a, "offset"_a,
           "Threshold-systematic selection: chosen items, and weights max(1, tau / "
           "target).");
+    m.def("learning_passes", &learning_passes, "spp"_a, "pixels"_a,
+          "The passes of a rendering that learns: first sample, count and role of each.");
     m.def("resample", &resample, "importance"_a, "probability"_a, "reservoirs"_a,
           "greedy"_a = true, "seed"_a = 0,
           "Deal candidates to reservoirs: the items held, and their weights C = W / H.");

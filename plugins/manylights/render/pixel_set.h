@@ -36,26 +36,43 @@ public:
 
     /// How many numbers there are
     uint32_t size() const {
-        return trains() ? m_columns * ((m_height + kSide - 1) / kSide)
-                        : m_width * m_height;
+        return m_role == Role::All
+                   ? m_width * m_height
+                   : m_columns * ((m_height + kSide - 1) / kSide) * per_block();
+    }
+
+    /// Rows from that of a number's pixel on, as a block or the image has them
+    uint32_t row(uint32_t number) const {
+        return m_role == Role::All ? number / m_width
+                                   : number / (m_columns * per_block()) * kSide;
     }
 
     Pixel pixel(const UInt32 &number) const {
-        auto [y, x] = divide(number, trains() ? m_columns : m_width);
-        if (m_role == Role::All)
+        if (m_role == Role::All) {
+            auto [y, x] = divide(number, m_width);
             return { x, y, Mask(true) };
+        }
+        auto [block, rest] = divide(number, per_block());
+        auto [row, column] = divide(block, m_columns);
+        UInt32 place       = trained(column, row);
         if (m_role == Role::Rest)
-            return { x, y, !is_trained(x, y) };
-        auto [trained_x, trained_y] = in_block(x, y);
-        return { trained_x, trained_y, trained_x < m_width && trained_y < m_height };
+            place = rest + dr::select(rest >= place, UInt32(1), UInt32(0));
+        UInt32 x = column * kSide + place % kSide, y = row * kSide + place / kSide;
+        return { x, y, x < m_width && y < m_height };
     }
 
     /// Coordinates may be beyond the borders, as unsigned numbers
     Number number(const UInt32 &x, const UInt32 &y) const {
         Mask inside = x < m_width && y < m_height;
-        if (!trains())
+        if (m_role == Role::All)
             return { dr::fmadd(y, m_width, x), inside };
-        return { dr::fmadd(y / kSide, m_columns, x / kSide), inside && is_trained(x, y) };
+        UInt32 column = x / kSide, row = y / kSide,
+               block = dr::fmadd(row, m_columns, column), out = trained(column, row),
+               place = place_in_block(x, y);
+        if (m_role == Role::Train)
+            return { block, inside && place == out };
+        UInt32 rest = place - dr::select(place > out, UInt32(1), UInt32(0));
+        return { dr::fmadd(block, per_block(), rest), inside && place != out };
     }
 
     /// Is a pixel within the borders in the set?
@@ -65,16 +82,20 @@ public:
 
 private:
     bool trains() const { return m_role == Role::Train; }
+    uint32_t per_block() const { return trains() ? 1 : kSide * kSide - 1; }
 
-    /// The pixel of a block that trains
-    std::pair<UInt32, UInt32> in_block(const UInt32 &column, const UInt32 &row) const {
-        UInt32 hash = mitsuba::sample_tea_32(row * m_columns + column, m_seed).first;
-        return { column * kSide + (hash & 3u), row * kSide + ((hash >> 2u) & 3u) };
+    /// Place of the pixel of a block that trains
+    UInt32 trained(const UInt32 &column, const UInt32 &row) const {
+        return mitsuba::sample_tea_32(row * m_columns + column, m_seed).first %
+               (kSide * kSide);
+    }
+
+    static UInt32 place_in_block(const UInt32 &x, const UInt32 &y) {
+        return (y % kSide) * kSide + x % kSide;
     }
 
     Mask is_trained(const UInt32 &x, const UInt32 &y) const {
-        auto [trained_x, trained_y] = in_block(x / kSide, y / kSide);
-        return x == trained_x && y == trained_y;
+        return place_in_block(x, y) == trained(x / kSide, y / kSide);
     }
 
     uint32_t m_width, m_height, m_columns;

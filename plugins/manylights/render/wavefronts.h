@@ -30,7 +30,7 @@ public:
     void render(const Pass &pass) {
         SampleCount<Float, Spectrum> guard(m_sampler);
         // No pixel has more samples at once than a part, if the sampler lets us choose
-        uint32_t most = pass.sampler.divides() ? most_lanes() : pass.plan.count;
+        uint32_t most = pass.sampler.divides() ? most_lanes(1) : pass.plan.count;
         for (uint32_t done = 0; done < pass.plan.count; done += most)
             render_samples(pass.piece(done, std::min(most, pass.plan.count - done)));
     }
@@ -40,8 +40,8 @@ private:
         m_sampler->set_sample_count(pass.sampler_count);
         uint32_t samples = samples_per_pixel(pass);
         Pixels pixels(m_size.x(), m_size.y(), pass.plan.role, pass.plan_seed);
-        uint64_t count = pixels.size(),
-                 parts = (count * samples + most_lanes() - 1) / most_lanes();
+        uint64_t count = pixels.size(), most = most_lanes(samples),
+                 parts = (count * samples + most - 1) / most;
         uint32_t part  = (uint32_t) ((count + parts - 1) / parts);
         for (uint32_t first = 0; first < count && !m_integrator.should_stop();
              first += part)
@@ -49,11 +49,13 @@ private:
                         samples);
     }
 
-    /// The samples of a part take at most so much memory
+    /// The samples of a part and their sums take at most so much memory
     static constexpr uint32_t kPartBytes = 1u << 30;
 
-    uint32_t most_lanes() const {
-        auto wanted = kPartBytes / (uint32_t) (sizeof(ScalarFloat) * (m_channels + 2));
+    uint32_t most_lanes(uint32_t samples) const {
+        uint32_t numbers =
+            (uint32_t) m_channels + 2 + Sums::stored(m_film, m_channels) / samples;
+        uint32_t wanted = kPartBytes / ((uint32_t) sizeof(ScalarFloat) * numbers);
         uint32_t result = 1;
         while (2 * result <= wanted)
             result *= 2;
@@ -106,16 +108,15 @@ private:
             dr::sync_thread();
         dr::eval();
         m_has_part = true;
-        Sums(m_film, m_size, pixels).add(result, rows(pass, first, count));
+        Sums(m_film, m_size, pixels).add(result, rows(pass, pixels, first, count));
     }
 
     /// Those that numbers of a set of pixels are in
-    std::pair<uint32_t, uint32_t> rows(const Pass &pass, uint32_t first,
-                                       uint32_t count) const {
-        uint32_t side    = pass.plan.role == Role::Train ? Pixels::kSide : 1,
-                 columns = (m_size.x() + side - 1) / side;
-        return { first / columns * side,
-                 std::min(((first + count - 1) / columns + 1) * side, m_size.y()) };
+    std::pair<uint32_t, uint32_t> rows(const Pass &pass, const Pixels &pixels,
+                                       uint32_t first, uint32_t count) const {
+        uint32_t side = pass.plan.role == Role::All ? 1 : Pixels::kSide;
+        return { pixels.row(first),
+                 std::min(pixels.row(first + count - 1) + side, m_size.y()) };
     }
 
     /// Where gradients are wanted
@@ -145,8 +146,7 @@ private:
         if (!pass.sampler.pattern && first > 0)
             seed = mitsuba::sample_tea_32(seed, UInt32(first), 6).first;
         // A pattern depends on the number of a pixel's first lane: to be that of all samples
-        bool whole =
-            samples == m_sampler->sample_count() && pass.plan.role != Role::Train;
+        bool whole = samples == m_sampler->sample_count() && pass.plan.role == Role::All;
         if (pass.sampler.pattern && whole)
             seed += first * samples;
         else if (pass.sampler.pattern)
