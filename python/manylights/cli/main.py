@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 
-from manylights.cli import bench, compare, convert, demo, render, report, tree
+from manylights.cli import bench, compare, convert, demo, merge, render, report, tree
 from manylights.errors import one_line
 from manylights.progress import INTERRUPTED
 
@@ -14,7 +14,7 @@ from manylights.progress import INTERRUPTED
 FAILURE = 2
 
 #: In the order of the help; each has ``add(commands, common)``.
-COMMANDS = (render, tree, convert, demo, bench, compare, report)
+COMMANDS = (render, merge, tree, convert, demo, bench, compare, report)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -25,7 +25,9 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: what follows the command's name. Default: what the process was started with.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
     options = parser().parse_args(arguments)
+    options.arguments = arguments
     try:
         return options.command(options) or 0
     except KeyboardInterrupt:

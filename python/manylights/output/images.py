@@ -30,14 +30,17 @@ def write_images(bitmap, target: Path) -> tuple[list[Path], list[str]]:
     Returns:
         The written files, and lines for the log about what could not be written.
     """
-    written, notes = [write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)], []
+    written = [write_whole(bitmap, target, mi.Bitmap.FileFormat.OpenEXR)]
+    previews, notes = write_preview(bitmap, target)
+    return written + previews, notes
+
+
+def write_preview(bitmap, target: Path) -> tuple[list[Path], list[str]]:
+    """Write the PNG of :func:`write_images` alone, beside ``target``."""
     preview = _preview(bitmap)
     if preview is None:
-        notes.append("preview: the film has no colour channels, no PNG written")
-    else:
-        file_format = mi.Bitmap.FileFormat.PNG
-        written.append(write_whole(preview, target.with_suffix(".png"), file_format))
-    return written, notes
+        return [], ["preview: the film has no colour channels, no PNG written"]
+    return [write_whole(preview, target.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)], []
 
 
 def exposed(bitmap, factor: float):

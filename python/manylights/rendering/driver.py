@@ -79,6 +79,13 @@ class Driver:
         report(1.0)
         return raw * np.float32(step.spp) if self.adjoint else raw
 
+    def blank(self) -> np.ndarray:
+        """Return the film's sums before any step: zeros. Makes its channels known."""
+        film = self.sensor.film()
+        film.prepare(self.integrator.aov_names())
+        film.clear()
+        return np.array(film.develop(raw=True))
+
     def end(self) -> None:
         """Leave integrator and sampler as they were: they make their own passes again."""
         if self.plans:
@@ -100,6 +107,10 @@ class Driver:
     def channels(self) -> list[str]:
         """Return the names of the film's channels as they are summed, after the first step."""
         return channels.names(self.sensor.film().bitmap(raw=True))
+
+    def shown(self) -> list[str]:
+        """Return the names of the channels that the film makes of them for its image."""
+        return channels.names(self.sensor.film().bitmap())
 
     def _follow(self, step: Step) -> None:
         if self.plans:
