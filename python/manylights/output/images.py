@@ -60,7 +60,9 @@ def _preview(bitmap):
     picture = channels.colors(bitmap)
     if picture is None:
         return None
-    return picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    picture = picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    # Without what the image's attributes say of the render
+    return mi.Bitmap(np.array(picture))
 
 
 def write_whole(bitmap, target: Path, file_format) -> Path:
