@@ -62,7 +62,7 @@ class Driver:
             report: called with the finished fraction of the step.
         """
         self._follow(step)
-        planned = self.indexed and step.passes and self.plans
+        planned = step.passes and self.plans
         spp = spp if planned else step.spp
 
         def report_blocks(fraction: float) -> None:
