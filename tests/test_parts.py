@@ -248,6 +248,20 @@ def test_films_samplers_and_integrators_keep_their_bits(
     assert content(tmp_path / "merged.exr") == content(tmp_path / "whole.exr")
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_small_last_steps_use_what_larger_ones_learnt(run, parts, tmp_path, monkeypatch, variant):
+    """Its size follows the samples of the whole render, not those of a step."""
+    variant = require_variant(variant)
+    monkeypatch.setattr(plan, "MOST_SAMPLES", dict.fromkeys(plan.MOST_SAMPLES, 2**14))
+    arguments = ("--spp", 70, "--sampler", "independent")
+    assert run(*arguments, variant=variant, out="whole.exr")[0] == 0
+    for number in range(1, 6):
+        learnt = ("--learnt", tmp_path / "a.part-01-of-05.exr") if number > 1 else ()
+        assert run(*arguments, "--part", f"{number}/5", *learnt, variant=variant)[0] == 0
+    assert run.merge(*tmp_path.glob("a.part-*.exr"))[0] == 0
+    assert content(tmp_path / "merged.exr") == content(tmp_path / "whole.exr")
+
+
 def test_exposure_is_that_of_the_whole(tmp_path, scalar, scene):
     """A factor that USD cameras have."""
 
@@ -455,6 +469,30 @@ def test_files_that_make_no_sense_are_named(run, two, name, value):
     bitmap.write(str(two[1]))
     status, log = run.merge(*two)
     assert status == 2 and f"{two[1]}: not a whole part or image" in log
+    assert "checksum" not in log
+
+
+def test_changed_bits_are_found(run, two, tmp_path):
+    """Anywhere: in the sums or in what is said of them, or in what nobody reads."""
+    assert run.merge(*two)[0] == 0
+    expected = content(tmp_path / "merged.exr")
+    whole, places = two[1].read_bytes(), np.random.default_rng(4)
+    found = 0
+    for place in places.integers(len(whole), size=40):
+        changed = bytearray(whole)
+        changed[place] ^= 1 << int(places.integers(8))
+        two[1].write_bytes(changed)
+        status, log = run.merge(*two)
+        assert status == 2 or content(tmp_path / "merged.exr") == expected
+        assert status == 0 or str(two[1]) in log
+        found += status == 2
+    assert found > 20
+
+
+def test_another_format_is_told(run, two, monkeypatch):
+    monkeypatch.setattr("manylights.rendering.state_file.FORMAT", 2)
+    status, log = run.merge(*two)
+    assert status == 2 and "(format 3 and not 2, written by manylights" in log
 
 
 def test_other_images_are_no_parts(run, two, tmp_path):

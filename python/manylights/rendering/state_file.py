@@ -24,6 +24,7 @@ import numpy as np
 from manylights.errors import UsageError, one_line
 from manylights.output import channels, images
 from manylights.rendering.develop import WEIGHT, picture
+from manylights.rendering.job import FORMAT
 from manylights.rendering.parts import Part, Run
 from manylights.rendering.state import State
 from manylights.rendering.sums import PARTS, Sums
@@ -72,7 +73,9 @@ def write(saved: Saved) -> Path:
     done |= {"learnt": _packed(state.learnt), "sequences": len(state.sums)}
     done["runs"] = [[run.part.number, run.part.count, run.done] for run in saved.runs]
     done |= {"processors": state.processors, "command": saved.command}
-    sign(bitmap, {**facts, **done}, state.history.spp)
+    facts = {**facts, **done, "samples_done": state.history.spp}
+    facts["checksum"] = _checksum(facts, state.sums)
+    sign(bitmap, facts, state.history.spp)
     return images.write_whole(bitmap, saved.path, mi.Bitmap.FileFormat.OpenEXR)
 
 
@@ -110,10 +113,15 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
 
 
 def _saved(path: Path, bitmap, facts: dict[str, Any]) -> Saved:
+    if facts["format"] != FORMAT:
+        version = facts.get("version")
+        raise ValueError(f"format {facts['format']} and not {FORMAT}, written by {version}")
     if "channels" not in facts:
         return Saved(path, facts, [], None, [], [])
     runs = [_run(run, facts["step_count"]) for run in facts["runs"]]
     state = _state(channels.split(bitmap), facts)
+    if _checksum(facts, state.sums) != facts["checksum"]:
+        raise ValueError("checksum")
     command = [str(word) for word in facts["command"]]
     return Saved(path, facts, runs, state, list(facts["shown"]), command)
 
@@ -148,6 +156,15 @@ def _parts(sums: list[Sums]):
     zeros = np.zeros_like(sums[0].parts)
     for one in sums:
         yield from zeros if one.parts is None else one.parts
+
+
+def _checksum(facts: dict[str, Any], sums: list[Sums]) -> int:
+    """Return CRC-32 of facts and sums: files travel."""
+    facts = {name: value for name, value in facts.items() if name != "checksum"}
+    result = zlib.crc32(json.dumps(facts, sort_keys=True).encode())
+    for part in _parts(sums):
+        result = zlib.crc32(np.ascontiguousarray(part), result)
+    return result
 
 
 def _packed(counts: np.ndarray) -> str:
