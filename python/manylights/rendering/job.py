@@ -178,10 +178,10 @@ def differences(old: dict[str, Any], new: dict[str, Any], but: tuple[str, ...] =
 def _check_part(part: Part, driver: Driver, noise, seconds) -> None:
     """Raise ``UsageError`` if parts of this cannot be added."""
     if noise is not None or seconds is not None:
-        name = "until_noise" if noise is not None else "seconds"
+        target = "noise" if noise is not None else "time"
         raise UsageError(
-            f"{part.words()}: needs a fixed number of samples. With {name} each step depends on "
-            "what all those before have given"
+            f"{part.words()}: needs a fixed number of samples. With a {target} as the target each "
+            "step depends on what all those before have given"
         )
     film = driver.sensor.film().class_name()
     if film not in FILMS:

@@ -82,6 +82,7 @@ def merge(
     first, bitmap = state_file.read(paths[0], WHAT, "")
     if first.state is None:
         return _merge_images(first, bitmap, paths[1:], target)
+    del bitmap
     total = _Parts(first)
     for path in paths[1:]:
         total.add(state_file.read(path, WHAT, "")[0])
