@@ -461,6 +461,8 @@ def test_truncated_files_are_named(run, two, part):
         ("learnt", "AAAA"),
         ("learnt", "no base64"),
         ("step_count", "many"),
+        ("step_count", 10**12),
+        ("step_count", 1.5),
     ],
 )
 def test_files_that_make_no_sense_are_named(run, two, name, value):
@@ -554,6 +556,16 @@ def test_images_of_several_seeds_are_averaged_by_samples(run, tmp_path):
     assert (
         status == 2 and f"seed 2 comes twice: in {tmp_path / 'pair.exr'} and in {files[1]}" in log
     )
+
+
+@pytest.mark.parametrize(("name", "value"), [("seeds", []), ("samples_done", 0)])
+def test_images_that_make_no_sense_are_named(run, tmp_path, name, value):
+    assert run(out="one.exr")[0] == 0
+    bitmap = mi.Bitmap(str(tmp_path / "one.exr"))
+    bitmap.metadata()[f"manylights.{name}"] = json.dumps(value)
+    bitmap.write(str(tmp_path / "one.exr"))
+    status, log = run.merge(tmp_path / "one.exr")
+    assert status == 2 and f"{tmp_path}/one.exr: not a whole part or image" in log
 
 
 def test_images_of_other_renders_are_not_averaged(run, two, tmp_path):

@@ -102,8 +102,8 @@ class _Parts:
         self.steps = self.facts["step_count"]
         # The files' runs are kept, their sums are not.
         self.state, first.state = first.state, None
-        if (steps_of(first.runs, self.steps) > 1).any():
-            raise UsageError(f"{first.path}: not a whole {WHAT} (it has a step twice)")
+        self.times = np.zeros(self.steps, np.uint32)
+        self._count_steps(first)
 
     def add(self, saved: Saved) -> None:
         """Add another file."""
@@ -116,7 +116,7 @@ class _Parts:
         if changes:
             text = "; ".join(changes)
             raise UsageError(f"{saved.path}: not of the render of {self.first.path}. It has {text}")
-        self._check_steps(saved)
+        self._count_steps(saved)
         state, other = self.state, saved.state
         if state.channels != other.channels or len(other.sums) != 1:
             raise UsageError(f"{saved.path}: has other channels than {self.first.path}")
@@ -133,15 +133,19 @@ class _Parts:
         saved.state = None
         self.files.append(saved)
 
-    def _check_steps(self, saved: Saved) -> None:
+    def _count_steps(self, saved: Saved) -> None:
+        """Add the steps of a file to those that are there, once each."""
         mine = steps_of(saved.runs, self.steps)
-        for other in self.files:
-            for run in other.runs:
-                if ((steps_of([run], self.steps) > 0) & (mine > 0)).any():
-                    words = run.words(self.steps)
-                    raise UsageError(f"{words} comes twice: in {other.path} and in {saved.path}")
         if (mine > 1).any():
             raise UsageError(f"{saved.path}: not a whole {WHAT} (it has a step twice)")
+        self.times += mine
+        if not (self.times > 1).any():
+            return
+        known = [(other.path, run) for other in self.files for run in other.runs]
+        for path, run in known:
+            if (steps_of([run], self.steps) * mine).any():
+                words = run.words(self.steps)
+                raise UsageError(f"{words} comes twice: in {path} and in {saved.path}")
 
     def finish(self, target: Path | None, partial: bool) -> Merged:
         """Make the image, and write it or, if parts are missing, the sums."""

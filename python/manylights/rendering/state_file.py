@@ -36,6 +36,9 @@ ATTRIBUTE = "manylights."
 #: What is learnt has 38 MB at most; more is no file of ours.
 MOST_LEARNT = 2**26
 
+#: More steps take longer than anybody waits.
+MOST_STEPS = 2**26
+
 
 @dataclass
 class Saved:
@@ -116,9 +119,14 @@ def _saved(path: Path, bitmap, facts: dict[str, Any]) -> Saved:
     if facts["format"] != FORMAT:
         version = facts.get("version")
         raise ValueError(f"format {facts['format']} and not {FORMAT}, written by {version}")
+    steps = facts["step_count"]
+    if steps is not None and not 1 <= steps <= MOST_STEPS:
+        raise ValueError(f"{steps} steps")
     if "channels" not in facts:
+        if not facts["seeds"] or not 1 <= facts["samples_done"] < 2**53:
+            raise ValueError(f"{facts['samples_done']} samples of the seeds {facts['seeds']}")
         return Saved(path, facts, [], None, [], [])
-    runs = [_run(run, facts["step_count"]) for run in facts["runs"]]
+    runs = [_run(run, steps) for run in facts["runs"]]
     state = _state(channels.split(bitmap), facts)
     if _checksum(facts, state.sums) != facts["checksum"]:
         raise ValueError("checksum")
