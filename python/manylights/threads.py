@@ -1,6 +1,9 @@
-"""The number of threads that Mitsuba computes with."""
+"""What Mitsuba computes with: the number of threads, and on which processor."""
 
 from __future__ import annotations
+
+import platform
+from pathlib import Path
 
 import drjit as dr
 
@@ -24,3 +27,13 @@ class thread_count:
 def threads_for_files() -> thread_count:
     """Context for reading and writing images: Mitsuba 3.9 never ends to do so with one thread."""
     return thread_count(2 if dr.thread_count() < 2 else None)
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if "model name" in line]
+    return names[0] if names else platform.processor() or platform.machine()

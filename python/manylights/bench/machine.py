@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from manylights.threads import processor
+
 
 def versions() -> dict[str, str]:
     """Return the versions of all that computes."""
@@ -28,9 +30,8 @@ def versions() -> dict[str, str]:
 def describe() -> dict[str, Any]:
     """Return processor, cores, threads, memory and system, for JSON."""
     text = _text_of("/proc/cpuinfo")
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if "model name" in line]
     return {
-        "processor": names[0] if names else platform.processor() or platform.machine(),
+        "processor": processor(),
         "cores": _cores(text),
         "threads": dr.thread_count(),
         "memory_gib": _memory_gib(),

@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 
-from manylights.cli import bench, compare, convert, demo, info, render, report, tree, version
+from manylights.cli import bench, compare, convert, demo, info, merge, render, report, tree, version
 from manylights.errors import one_line
 from manylights.progress import INTERRUPTED
 
@@ -14,7 +14,7 @@ from manylights.progress import INTERRUPTED
 FAILURE = 2
 
 #: In the order of the help; each has ``add(commands, common)``.
-COMMANDS = (render, info, tree, convert, demo, bench, compare, report)
+COMMANDS = (render, merge, info, tree, convert, demo, bench, compare, report)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -25,8 +25,10 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: what follows the command's name. Default: what the process was started with.
     """
+    arguments = sys.argv[1:] if arguments is None else arguments
     made = parser()
     options = made.parse_args(arguments)
+    options.arguments = arguments
     if options.version:
         print(version.describe(options.verbose))
         return 0

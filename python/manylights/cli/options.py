@@ -9,6 +9,7 @@ from manylights import loading
 from manylights.loading import integrators
 from manylights.loading.parsing import MOST_SUBDIVISION
 from manylights.progress import say
+from manylights.rendering.parts import MOST_PARTS, Part
 
 VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scalar_rgb)"
 
@@ -145,6 +146,19 @@ def share(text: str) -> float:
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: must be a number above 0, 0.02 is 2 %")
     return value
+
+
+def part(text: str) -> Part:
+    """A part of several: 3/16."""
+    numbers = text.split("/")
+    if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+        raise argparse.ArgumentTypeError(f"{text}: must be K/N, 3/16 is the third of 16")
+    try:
+        return Part.of((int(numbers[0]), int(numbers[1])))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"{text}: must be K/N, 1 <= K <= N <= {MOST_PARTS}"
+        ) from error
 
 
 def duration(text: str) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from manylights import loading
@@ -13,6 +14,8 @@ from manylights.output import images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
 from manylights.rendering import Progress, RenderResult, render
 from manylights.rendering.checkpoint import path_for
+from manylights.rendering.parts import Part
+from manylights.rendering.render import part_path
 
 HELP = """\
 Renders a scene to an OpenEXR file and writes a PNG preview beside it. SCENE is an XML
@@ -36,6 +39,12 @@ kill or Ctrl-C the same command goes on from there, and the image is the same, b
 bit, as without interruption or checkpoint (but not with --for, which looks at the clock).
 The file is removed when the image is written. One of another job, of a changed scene or
 of another version is refused.
+
+--part 3/16 renders the third of 16 shares of the same steps, on any machine, and writes
+OUT.part-03-of-16.exr, a picture, too. manylights merge OUT.part-*.exr -o OUT.exr adds them
+to the image, the same, bit for bit, as without parts. Each part first learns what the first
+step teaches, or takes it from a part that is there with --learnt FILE. With --checkpoint
+a part keeps its state in its own file.
 """
 
 
@@ -86,8 +95,23 @@ def add(commands, common) -> None:
         metavar="SECONDS",
         help="keep the state every so often; after an interruption the same command goes on",
     )
+    _add_parts(parser)
     shared.add_machine(parser)
     parser.set_defaults(command=_run)
+
+
+def _add_parts(parser) -> None:
+    parser.add_argument(
+        "--part",
+        type=shared.part,
+        metavar="K/N",
+        help="render share K of N of the steps, for manylights merge",
+    )
+    parser.add_argument(
+        "--learnt",
+        metavar="FILE",
+        help="with --part: take what is learnt from this part or checkpoint of the same render",
+    )
 
 
 def _add_targets(parser) -> None:
@@ -135,9 +159,26 @@ def _run(options) -> None:
         raise UsageError(f"--sensor {options.sensor}: the scene has {count}, counted from 0")
     names = ("spp", "seed", "sensor", "until_noise", "seconds", "threads")
     wanted = {name: getattr(options, name) for name in names}
+    wanted |= {"part": _part(options), "learnt": options.learnt}
     if options.checkpoint is not None:
-        wanted |= {"checkpoint": path_for(target), "checkpoint_seconds": options.checkpoint}
+        path = part_path(target, options.part) if options.part else path_for(target)
+        wanted |= {"checkpoint": path, "checkpoint_seconds": options.checkpoint}
     render_to(loaded, target, wanted)
+
+
+def _part(options) -> Part | None:
+    """Return the part that was asked for, with the command line without it."""
+    if options.part is None:
+        return None
+    words, kept = iter(options.arguments), []
+    for word in words:
+        name, is_whole, _ = word.partition("=")
+        # Options can be abbreviated.
+        if not ("--part".startswith(name) and len(name) > 2):
+            kept.append(word)
+        elif not is_whole:
+            next(words)
+    return replace(options.part, command=tuple(kept))
 
 
 def render_to(loaded: loading.LoadedScene, target: Path, wanted: dict) -> RenderResult:

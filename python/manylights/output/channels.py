@@ -58,7 +58,7 @@ def read(path: str | Path, prefix: str = ""):
 
 def split(bitmap) -> dict[str, np.ndarray]:
     """Return the channels of a bitmap by name, shape (height, width) each, single precision."""
-    pixels = np.array(bitmap).astype(np.float32)
+    pixels = np.array(bitmap).astype(np.float32, copy=False)
     pixels = pixels.reshape(*pixels.shape[:2], -1)
     return {name: pixels[..., index] for index, name in enumerate(names(bitmap))}
 

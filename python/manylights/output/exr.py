@@ -114,6 +114,16 @@ def read_header(path: str | Path) -> tuple[list[str], tuple[int, int], dict[str,
         return names, (width, height), _attributes(header)
 
 
+def fact(value: Any) -> Any:
+    """Return what an attribute of ours stands for: JSON, or a number or text as it is."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return json.loads(value)
+    except ValueError:
+        return value
+
+
 def _opened(path: str | Path, **how):
     import OpenEXR
 

@@ -51,15 +51,20 @@ def write_images(
     with np.errstate(over="ignore"):
         pixels = exact.astype(number)
     planes = {name: pixels[..., index] for index, name in enumerate(channels.names(bitmap))}
-    written = [exr.write(target, {**planes, **(layers or {})}, attributes or {})]
+    own = {name: text for name, text in bitmap.metadata().items() if name.startswith(exr.OURS)}
+    own |= attributes or {}
+    written = [exr.write(target, {**planes, **(layers or {})}, own)]
     notes = _overflows(exact, pixels)
+    previews, more = write_preview(bitmap, target)
+    return written + previews, notes + more
+
+
+def write_preview(bitmap, target: Path) -> tuple[list[Path], list[str]]:
+    """Write the PNG of :func:`write_images` alone, beside ``target``."""
     preview = _preview(bitmap)
     if preview is None:
-        notes.append("preview: the film has no colour channels, no PNG written")
-    else:
-        file_format = mi.Bitmap.FileFormat.PNG
-        written.append(write_whole(preview, target.with_suffix(".png"), file_format))
-    return written, notes
+        return [], ["preview: the film has no colour channels, no PNG written"]
+    return [write_whole(preview, target.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)], []
 
 
 def number_of(film) -> type:
@@ -94,7 +99,9 @@ def _preview(bitmap):
     picture = channels.colors(bitmap)
     if picture is None:
         return None
-    return picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    picture = picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+    # Without what the image's attributes say of the render
+    return mi.Bitmap(np.array(picture))
 
 
 def write_whole(bitmap, target: Path, file_format) -> Path:

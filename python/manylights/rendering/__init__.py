@@ -6,11 +6,13 @@
 - ``driver``: has Mitsuba render a step, without files;
 - ``develop``, ``state``: images of sums; all that a render has so far;
 - ``job``: a render with all that its image depends on;
-- ``checkpoint``: keeps the state in a file;
-- ``render``: puts these together.
+- ``parts``: which steps each of several machines has;
+- ``state_file``, ``checkpoint``: the state in a file, and when it is written;
+- ``render``: puts these together, and ``merge`` what several have rendered.
 """
 
 from manylights.rendering.job import Job
+from manylights.rendering.merge import Merged, merge
 from manylights.rendering.render import Progress, RenderResult, render
 
-__all__ = ["Job", "Progress", "RenderResult", "render"]
+__all__ = ["Job", "Merged", "Progress", "RenderResult", "merge", "render"]

@@ -1,37 +1,23 @@
-"""Keeps the state of a long render in a file, so that the render can go on after it was killed.
-
-The file is an OpenEXR image that any viewer shows: the picture so far in its own channels, the
-parts of the film's sums in channels of their own (``output.channels``), and in the attributes
-``manylights.*`` what was rendered and learnt, as JSON. It is written under another name and then
-renamed: whoever is killed while writing leaves the one before.
-"""
+"""Keeps the state of a long render in a file, so that the render can go on after it was killed."""
 
 from __future__ import annotations
 
-import base64
-import json
 import time
-import zlib
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from manylights import files
 from manylights.errors import UsageError, one_line
-from manylights.output import channels, images
 from manylights.progress import say
-from manylights.rendering.develop import WEIGHT, picture
+from manylights.rendering import state_file
 from manylights.rendering.job import Job, differences
+from manylights.rendering.parts import Run
 from manylights.rendering.state import State
-from manylights.rendering.sums import Sums
-from manylights.rendering.targets import History
-
-#: Prefix of the file's attributes.
-ATTRIBUTE = "manylights."
+from manylights.rendering.state_file import Saved
+from manylights.threads import processor
 
 REMEDY = "delete it to start anew, or choose another output"
 
@@ -53,8 +39,9 @@ class Checkpoint:
         self,
         path: Path,
         job: Job,
-        seconds: float,
+        seconds: float = 60.0,
         clock: Callable[[], float] = time.monotonic,
+        facts: dict[str, Any] | None = None,
     ) -> None:
         """Know the job.
 
@@ -63,9 +50,10 @@ class Checkpoint:
             job: what is rendered.
             seconds: at least between two writings.
             clock: for tests.
+            facts: of the job, if they are known.
         """
         self.path, self.job, self.seconds, self.clock = path, job, seconds, clock
-        self.facts = job.facts()
+        self.facts = facts or job.facts()
         self.samples, self.last = 0, clock()
 
     def restore(self) -> State | None:
@@ -84,7 +72,8 @@ class Checkpoint:
         """Return what the file holds, for people; None if there is nothing yet."""
         if not self.samples:
             return None
-        of = "" if self.job.course.has_target else f" of {self.job.course.spp}"
+        course = self.job.course
+        of = "" if course.has_target else f" of {course.predicted_spp([])}"
         return f"{self.path} has {self.samples}{of} samples per pixel"
 
     def keep(self, state: State) -> None:
@@ -107,63 +96,45 @@ class Checkpoint:
         self.path.unlink(missing_ok=True)
         files.remove_leftovers(self.path)
 
+    def finish(self, state: State) -> None:
+        """Write the state at the end of a part, however long ago the last time was."""
+        self._write(state)
+
     def _write(self, state: State) -> None:
-        summed = state.channels
-        shown = [index for index, name in enumerate(summed) if name != WEIGHT]
-        image = picture(state.rough_total(self.job.driver.adjoint), summed)[..., shown]
-        names, parts = [summed[index] for index in shown], [image]
-        for prefix, part in zip(channels.sums(len(state.sums)), _parts(state.sums)):
-            names += [prefix + name for name in summed]
-            parts.append(part)
-        bitmap = channels.join(names, *parts)
-        done = {"history": asdict(state.history), "channels": summed}
-        done["learnt"] = _packed(state.learnt)
-        done |= {"sequences": len(state.sums), "samples_done": state.history.spp}
-        for name, value in {**self.facts, **done}.items():
-            bitmap.metadata()[ATTRIBUTE + name] = json.dumps(value)
-        images.write_whole(bitmap, self.path, mi.Bitmap.FileFormat.OpenEXR)
+        part = self.job.course.part
+        name = processor()
+        state.processors += [] if name in state.processors else [name]
+        runs, shown = [Run(part, state.history.steps)], self.job.driver.shown()
+        saved = Saved(self.path, self.facts, runs, state, shown, list(part.command))
+        state_file.write(saved)
 
     def _read(self) -> State:
-        try:
-            bitmap = channels.read(self.path)
-            facts = {
-                name[len(ATTRIBUTE) :]: json.loads(value)
-                for name, value in bitmap.metadata().items()
-                if name.startswith(ATTRIBUTE)
-            }
-        except (UsageError, ValueError) as error:
-            text = f"{self.path}: not a whole checkpoint, {REMEDY} ({one_line(error)})"
-            raise UsageError(text) from error
-        if "channels" not in facts:
+        saved, _ = state_file.read(self.path, "checkpoint", f", {REMEDY}")
+        if saved.state is None:
             raise UsageError(f"{self.path}: not a checkpoint of manylights, {REMEDY}")
-        changes = "; ".join(differences(facts, self.facts))
+        changes = "; ".join(differences(saved.facts, self.facts))
         if changes:
             raise UsageError(f"{self.path}: of another render, {REMEDY}. It has {changes}")
-        return _state(channels.split(bitmap), facts)
+        return saved.state
 
 
-def _parts(sums: list[Sums]):
-    """Yield the parts of the sums of all sequences, zeros where there are none yet."""
-    zeros = np.zeros_like(sums[0].parts)
-    for one in sums:
-        yield from zeros if one.parts is None else one.parts
+def learnt(path: Path, job: Job, facts: dict) -> np.ndarray:
+    """Return what the render of a part or a checkpoint of the same job has learnt.
 
+    Args:
+        path: the file.
+        job: the job.
+        facts: its own.
 
-def _state(found: dict[str, np.ndarray], facts: dict[str, Any]) -> State:
-    prefixes = channels.sums(facts["sequences"])
-    parts = [
-        np.stack([found[prefix + name] for name in facts["channels"]], axis=-1)
-        for prefix in prefixes
-    ]
-    count = len(prefixes) // facts["sequences"]
-    sums = [Sums(np.stack(parts[at : at + count])) for at in range(0, len(parts), count)]
-    history = History(**facts["history"])
-    return State(sums, history, facts["channels"], _unpacked(facts["learnt"]))
-
-
-def _packed(counts: np.ndarray) -> str:
-    return base64.b64encode(zlib.compress(counts.astype("<u4").tobytes())).decode()
-
-
-def _unpacked(text: str) -> np.ndarray:
-    return np.frombuffer(zlib.decompress(base64.b64decode(text)), "<u4").astype(np.uint32)
+    Raises:
+        UsageError: the file cannot be read, is of another job, or has learnt nothing.
+    """
+    saved, _ = state_file.read(path, "part or checkpoint", "")
+    if saved.state is None:
+        raise UsageError(f"{path}: an image, and not a part or a checkpoint: nothing was learnt")
+    changes = "; ".join(differences(saved.facts, facts, but=("part",)))
+    if changes:
+        raise UsageError(f"{path}: of another render. It has {changes}")
+    if not saved.state.learnt.size and job.course.training(State.empty(1).history) is not None:
+        raise UsageError(f"{path}: nothing was learnt yet")
+    return saved.state.learnt

@@ -62,7 +62,7 @@ class Driver:
             report: called with the finished fraction of the step.
         """
         self._follow(step)
-        planned = self.indexed and step.passes and self.plans
+        planned = step.passes and self.plans
         spp = spp if planned else step.spp
 
         def report_blocks(fraction: float) -> None:
@@ -78,6 +78,13 @@ class Driver:
         raw = np.array(self.sensor.film().develop(raw=True))
         report(1.0)
         return raw * np.float32(step.spp) if self.adjoint else raw
+
+    def blank(self) -> np.ndarray:
+        """Return the film's sums before any step: zeros. Makes its channels known."""
+        film = self.sensor.film()
+        film.prepare(self.integrator.aov_names())
+        film.clear()
+        return np.array(film.develop(raw=True))
 
     def end(self) -> None:
         """Leave integrator and sampler as they were: they make their own passes again."""
@@ -100,6 +107,10 @@ class Driver:
     def channels(self) -> list[str]:
         """Return the names of the film's channels as they are summed, after the first step."""
         return channels.names(self.sensor.film().bitmap(raw=True))
+
+    def shown(self) -> list[str]:
+        """Return the names of the channels that the film makes of them for its image."""
+        return channels.names(self.sensor.film().bitmap())
 
     def _follow(self, step: Step) -> None:
         if self.plans:

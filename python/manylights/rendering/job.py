@@ -13,12 +13,21 @@ import numpy as np
 
 from manylights.errors import UsageError
 from manylights.loading import LoadedScene
+from manylights.output import images
 from manylights.rendering import plan as plans
 from manylights.rendering.driver import ENTRIES, Driver
+from manylights.rendering.parts import WHOLE, Part
 from manylights.rendering.targets import MOST_SPP, Course, History
 
 #: Of the files that keep the state of a job; another one is refused.
-FORMAT = 2
+FORMAT = 3
+
+#: Facts in files about what was rendered so far.
+STATE = ("history", "channels", "shown", "learnt", "sequences", "runs", "processors", "command")
+STATE += ("samples_done", "checksum", "seeds", "noise")
+
+#: Films that can be made anew from what a file says, to develop the sums of parts.
+FILMS = ("HDRFilm",)
 
 #: A target counts as reached up to this factor: predictions are not exact.
 NEARLY = 1.1
@@ -34,6 +43,7 @@ class Job:
         seed: of the random numbers.
         course: which steps there are.
         driver: renders them.
+        part: that was asked for, if any.
     """
 
     loaded: LoadedScene
@@ -41,6 +51,7 @@ class Job:
     seed: int
     course: Course
     driver: Driver
+    part: Part | None = None
 
     @staticmethod
     def of(
@@ -51,6 +62,7 @@ class Job:
         noise: float | None = None,
         seconds: float | None = None,
         integrator=None,
+        part: Part | tuple[int, int] | None = None,
     ) -> Job:
         """Plan a render.
 
@@ -63,9 +75,11 @@ class Job:
             noise: to stop at, relative, > 0. Default: none.
             seconds: to stop after, > 0. Default: none.
             integrator: ``mi.Integrator``. Default: the scene's.
+            part: of several, which has some of the steps: number, from 1, and count. Default: all.
 
         Raises:
-            UsageError: there is no such sensor, or a number is out of range.
+            UsageError: there is no such sensor, a number is out of range, or there are no parts of
+                such a render.
         """
         sensors = loaded.scene.sensors()
         check("sensor", sensor, 0 <= sensor < len(sensors), f"0 to {len(sensors) - 1}")
@@ -74,10 +88,14 @@ class Job:
         for name, value in (("until_noise", noise), ("seconds", seconds)):
             check(name, value, value is None or 0.0 < value < np.inf, "a number above 0")
         driver = Driver(loaded, sensors[sensor], integrator)
+        part = Part.of(part)
+        if part is not None:
+            _check_part(part, driver, noise, seconds)
         if spp is None:
             aimless = noise is None and seconds is None
             spp = driver.sensor.sampler().sample_count() if aimless else MOST_SPP
-        return Job(loaded, sensor, seed, Course(spp, driver.limits(), noise, seconds), driver)
+        course = Course(spp, driver.limits(), noise, seconds, part or WHOLE)
+        return Job(loaded, sensor, seed, course, driver, part)
 
     @property
     def film(self):
@@ -92,6 +110,11 @@ class Job:
     def notes(self, done: History, noise: float | None) -> list[str]:
         """Return what is to be said at the end of a render."""
         course, result = self.course, []
+        count, part = course.step_count, course.part
+        if count is not None and part.count > count:
+            empty = "" if part.steps(count) else f"{part.words()} is empty, "
+            steps = "1 step" if count == 1 else f"{count} steps"
+            result.append(f"parts: this render has {steps}, {empty}at most {count} share the work")
         if not course.limits.indexed and done.steps > 1:
             name = self.driver.sensor.sampler().class_name()
             result.append(
@@ -124,24 +147,47 @@ class Job:
             "size": f"{width} x {height}",
             "sampler": self.driver.sensor.sampler().class_name(),
             "steps": self.course.limits.largest(),
+            "step_count": self.course.step_count,
+            "part": str(self.course.part),
+            "film": self.film.class_name(),
+            "number": np.dtype(images.number_of(self.film)).name,
+            "adjoint": self.driver.adjoint,
+            "exposure": self.loaded.exposure,
             **self.loaded.choices,
             "files": _digests(self.loaded.files) or {"scene": _digest(self.loaded.scene)},
         }
 
 
-def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Return in words what the facts of two jobs do not share, the old one's value first."""
-    changed = [name for name in new if old.get(name) != new[name]]
+def differences(old: dict[str, Any], new: dict[str, Any], but: tuple[str, ...] = ()) -> list[str]:
+    """Return in words what the facts of two jobs do not share, the old one's value first.
+
+    What files say of their state is not compared, nor are the facts ``but``.
+    """
+    names = [name for name in {**new, **old} if name not in (*STATE, *but)]
+    changed = [name for name in names if old.get(name) != new.get(name)]
     changes = [
-        f"{name} {_words(old.get(name))} and not {_words(new[name])}"
+        f"{name} {_words(old.get(name))} and not {_words(new.get(name))}"
         for name in changed
         if name != "files"
     ]
     if "files" in changed:
-        before, now = old.get("files", {}), new["files"]
+        before, now = old.get("files", {}), new.get("files", {})
         names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
         changes.append(f"another content of {', '.join(names)}")
     return changes
+
+
+def _check_part(part: Part, driver: Driver, noise, seconds) -> None:
+    """Raise ``UsageError`` if parts of this cannot be added."""
+    if noise is not None or seconds is not None:
+        target = "noise" if noise is not None else "time"
+        raise UsageError(
+            f"{part.words()}: needs a fixed number of samples. With a {target} as the target each "
+            "step depends on what all those before have given"
+        )
+    film = driver.sensor.film().class_name()
+    if film not in FILMS:
+        raise UsageError(f"{part.words()}: parts of a {film} cannot be merged, only of an hdrfilm")
 
 
 def check(name: str, value, allowed: bool, what: str) -> None:

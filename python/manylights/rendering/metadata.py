@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from typing import Any
 
@@ -17,31 +16,25 @@ CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 #: Columns of names in what ``describe`` returns.
 INDENT = 20
 
-#: Facts of a job that only tell whether a state belongs to it.
-OF_STATES = ("format", "steps", "until_noise", "seconds", "spp", "size")
-
 
 def attributes(job, result) -> dict[str, Any]:
     """Return the attributes of the file of ``result`` (``RenderResult``) by name.
 
-    Those of the OpenEXR standard have its names, all others begin with ``manylights.``: scene and
-    digests of its files, samples, seed, noise, integrator with all parameters, variant, versions.
+    Those of the OpenEXR standard have its names, others begin with ``manylights.``. The facts of
+    the job are not among them (``state_file.sign``).
     """
-    facts = {name: value for name, value in job.facts().items() if name not in OF_STATES}
-    facts |= {
+    own = {
         "samples": result.samples,
-        "seconds": round(result.seconds, 3),
-        "noise": result.noise,
-        "integrator": _parameters(job.driver.integrator),
+        "seconds_taken": round(result.seconds, 3),
+        "parameters": _parameters(job.driver.integrator),
     }
-    if job.loaded.files:
-        facts["scene"] = str(job.loaded.files[0].name)
-    known = {name: value for name, value in facts.items() if value not in (None, {}, "")}
+    if result.noise is not None:
+        own["noise"] = result.noise
     return {
-        "software": facts["version"],
+        "software": job.facts()["version"],
         "chromaticities": CHROMATICITIES,
         **camera_matrices(job.driver.sensor),
-        **{exr.OURS + name: value for name, value in known.items()},
+        **{exr.OURS + name: value for name, value in own.items()},
     }
 
 
@@ -84,22 +77,30 @@ def _projection(sensor, parameters: dict[str, Any]) -> np.ndarray:
 
 
 def describe(attributes: dict[str, Any]) -> list[str]:
-    """Return the attributes of a file for people, a line or more each, our own first."""
+    """Return the attributes of a file for people, a line or more each, our own first.
+
+    Facts without a value are left out.
+    """
     ordered = sorted(attributes.items(), key=lambda item: not item[0].startswith(exr.OURS))
     lines = []
     for name, value in ordered:
-        first, *rest = _text(value).splitlines() or [""]
-        lines.append(f"{name.removeprefix(exr.OURS) + ':':<{INDENT - 1}} {first}")
-        lines += [" " * INDENT + line for line in rest]
+        if text := _text(value):
+            first, *rest = text.splitlines()
+            lines.append(f"{name.removeprefix(exr.OURS) + ':':<{INDENT - 1}} {first}")
+            lines += [" " * INDENT + line for line in rest]
     return lines
 
 
 def _text(value: Any) -> str:
-    """Return a value for people; dictionaries, which files keep as JSON, a line for each item."""
-    if isinstance(value, str) and value.startswith("{"):
-        return "\n".join(f"{key} = {item}" for key, item in json.loads(value).items())
+    """Return a value for people; of dictionaries a line for each item, nothing of none."""
+    if isinstance(value, str):
+        value = exr.fact(value)
+    if isinstance(value, dict):
+        return "\n".join(f"{key} = {item}" for key, item in value.items())
     if isinstance(value, np.ndarray):
         return np.array2string(value, precision=6, suppress_small=True)
-    if isinstance(value, tuple):
-        return ", ".join(f"{number:.4g}" for number in value)
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, (tuple, list)):
+        return ", ".join(f"{item:.4g}" if isinstance(item, float) else str(item) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "" if value is None else str(value)

@@ -135,23 +135,48 @@ def steps(spp: int, limits: Limits) -> Iterator[Step]:
     >>> [(one.first, one.count, one.role) for one in next(steps(300, limits)).passes]
     [(0, 5, 1), (5, 5, 1), (0, 10, 2), (10, 118, 0)]
     """
-    index = 0
-    while (step := step_at(index, spp, limits)) is not None:
-        yield step
-        index += 1
+    return (step_at(index, spp, limits) for index in range(step_count(spp, limits)))
 
 
 def step_at(index: int, spp: int, limits: Limits) -> Step | None:
     """Return step ``index`` of those of :func:`steps`, None after the last one."""
-    if spp * limits.pixels <= SINGLE_STEP_SAMPLES:
-        return Step((), spp, 0, 0) if index == 0 else None
-    size = limits.largest()
-    if not limits.indexed:
-        size = min(size, power_of_two(spp // LEAST_STEPS))
-    first = index * size
-    if first >= spp:
+    if not 0 <= index < step_count(spp, limits):
         return None
+    if is_single(spp, limits):
+        return Step((), spp, 0, 0)
+    size = step_size(spp, limits)
+    first = index * size
     return Step.of(passes(first, min(size, spp - first), limits), 0, index)
+
+
+def step_count(spp: int, limits: Limits) -> int:
+    """Return how many steps there are."""
+    return -(-spp // step_size(spp, limits))
+
+
+def step_size(spp: int, limits: Limits) -> int:
+    """Return the samples per pixel of all steps but the last."""
+    if is_single(spp, limits):
+        return spp
+    size = limits.largest()
+    return size if limits.indexed else min(size, power_of_two(spp // LEAST_STEPS))
+
+
+def is_single(spp: int, limits: Limits) -> bool:
+    """Is it one step, whose passes the integrator makes?"""
+    return spp * limits.pixels <= SINGLE_STEP_SAMPLES
+
+
+def training(spp: int, limits: Limits) -> Step | None:
+    """Return a step of the training passes alone, None if there are none.
+
+    Its film is not part of the image: it teaches those who do not render the first step.
+    """
+    if is_single(spp, limits):
+        return None
+    first = step_at(0, spp, limits)
+    passes = tuple(one for one in first.passes if one.role == TRAIN)
+    return Step(passes, first.spp, 0, 0) if passes else None
 
 
 def passes(first: int, count: int, limits: Limits) -> list[Pass]:

@@ -10,16 +10,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from manylights import loading
 from manylights.errors import UsageError
 from manylights.output import channels, images
-from manylights.rendering import metadata
+from manylights.rendering import checkpoint as checkpoints
+from manylights.rendering import metadata, state_file
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
 from manylights.rendering.job import Job, check
+from manylights.rendering.parts import Part
 from manylights.rendering.state import State
 from manylights.threads import thread_count
 
@@ -83,6 +86,8 @@ def render(
     output: str | Path | None = None,
     checkpoint: str | Path | None = None,
     checkpoint_seconds: float = 60.0,
+    part: tuple[int, int] | Part | None = None,
+    learnt: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
 ) -> RenderResult:
@@ -105,37 +110,61 @@ def render(
         until_noise: render until ``RenderResult.noise`` is this, above 0: 0.02 is 2 %.
         seconds: render for so long, above 0. The last step may end later, by its length or 5 %.
         output: file (.exr) to write the image to, with a PNG beside it. Default: none.
-        checkpoint: file (.exr) that keeps the state; if there is one of the same render it goes on
-            from there. Removed once there is an image. Default: the state is not kept.
+        checkpoint: file (.exr) that keeps the state, to go on from there another time. Removed once
+            there is an image. Default: the state is not kept.
         checkpoint_seconds: at least between two writings of it.
+        part: ``(3, 16)`` renders the third of 16 shares of the steps, with ``output="a.exr"`` to
+            ``a.part-03-of-16.exr``, for ``manylights.merge``. Default: all, without parts.
+        learnt: file of another part, to take over what is learnt. Default: learn it anew.
         progress: called before the first step and after each, in scalar variants also in between
             and from other threads. What it raises ends the render.
         threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
 
     Raises:
-        UsageError: (a ``ValueError``) a number out of range, no such file or sensor, a checkpoint
-            of another render.
+        UsageError: (a ``ValueError``) a number out of range, no such file or sensor, no parts of
+            such a render, a file of another render.
         RuntimeError: Mitsuba cannot read or render the scene.
     """
     check("threads", threads, threads is None or threads >= 1, "1 or more")
     target = None if output is None else images.check_output(str(output))
     loaded, own = loading.as_loaded(scene, integrator)
-    job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own)
+    job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
+    facts, state = _begin(job, store, target, learnt)
     with thread_count(threads):
-        state = run(job, store, progress or (lambda _: None))
-    return _finished(job, state, store, target)
+        run(job, state, store, progress or (lambda _: None))
+    return _finished(job, state, store, facts, target)
 
 
-def _finished(job: Job, state: State, store: Checkpoint | None, target: Path | None):
+def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
+    """Return the facts that files need, and the state that the render goes on from."""
+    check("learnt", learnt, learnt is None or job.part is not None, "given with part")
+    # Before the render, which may change the scene's parameters.
+    facts = store.facts if store else job.facts() if target or learnt else {}
+    state = (store and store.restore()) or State.empty(job.course.sequences)
+    if learnt is not None and not state.learnt.size:
+        state.learnt = checkpoints.learnt(Path(learnt), job, facts)
+    return facts, state
+
+
+def part_path(target: str | Path, part: Part) -> Path:
+    """Return where a part of an image is: beside it, ``OUT.part-03-of-16.exr``."""
+    return Path(target).with_suffix(f".{part.name()}.exr")
+
+
+def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -> RenderResult:
     result = result_of(job, state)
-    if target is not None:
-        layers = variance_layers(result)
-        attributes = metadata.attributes(job, result)
+    if target is not None and job.part is not None:
+        path = part_path(target, job.part)
+        Checkpoint(path, job, facts=facts).finish(state)
+        result.files = [path]
+    elif target is not None:
+        state_file.sign(result.bitmap, {**facts, "seeds": [job.seed]}, result.samples)
+        layers, attributes = variance_layers(result), metadata.attributes(job, result)
         number = images.number_of(job.film)
         result.files, notes = images.write_images(result.bitmap, target, layers, attributes, number)
         result.notes += notes
-    if store is not None:
+    if store is not None and store.path not in result.files:
         store.remove()
     return result
 
@@ -161,22 +190,24 @@ def _store(path: str | Path, job: Job, seconds: float) -> Checkpoint:
 
 def run(
     job: Job,
+    state: State,
     store: Checkpoint | None,
     progress: Callable[[Progress], None],
     clock: Callable[[], float] = time.perf_counter,
-) -> State:
-    """Render the steps of a job that ``store`` does not have, and return the state at the end."""
-    state = (store and store.restore()) or State.empty(job.course.sequences)
+) -> None:
+    """Render the steps of a job that the state does not have, and add them to it."""
     history, driver = state.history, job.driver
 
     def tell(fraction_of_step: float = 0.0, spp: int = 0) -> None:
         spent = clock() - start
         progress(_progress(job, state, store, fraction_of_step * spp, spent))
 
-    start = clock()
+    start, begun = clock(), history.steps
     tell()
     driver.learn(state.learnt)
     try:
+        _learn(job, state)
+        history.seconds += clock() - start
         while (step := job.course.next_step(history)) is not None:
             start = clock()
             seed = job.seed_of(step)
@@ -195,9 +226,24 @@ def run(
             history.seconds += clock() - start
             start = clock()
             tell()
+        state.learnt = driver.learnt()
     finally:
         driver.end()
-    return state
+    if history.steps == begun:
+        _add_nothing(job, state)
+
+
+def _learn(job: Job, state: State) -> None:
+    """Learn what the first step teaches, if this part does not have it."""
+    driver, step = job.driver, job.course.training(state.history)
+    if step is not None and not state.learnt.size:
+        driver.render(step, job.seed_of(step), job.course.spp, lambda done: None)
+
+
+def _add_nothing(job: Job, state: State) -> None:
+    """Make the film, which no step has made, and the sums if there are none."""
+    state.sums[0].add(job.driver.blank())
+    state.channels = job.driver.channels()
 
 
 def result_of(job: Job, state: State) -> RenderResult:
@@ -215,7 +261,8 @@ def _progress(job: Job, state: State, store, begun: float, spent: float) -> Prog
     """Return how far a render is with some samples of a step and some seconds of it."""
     history, course = state.history, job.course
     seconds = history.seconds + spent
-    fraction = (history.spp + begun) / course.predicted_spp(history.noises)
+    predicted = course.predicted_spp(history.noises)
+    fraction = (history.spp + begun) / predicted if predicted else 1.0
     if course.seconds is not None:
         fraction = max(fraction, seconds / course.seconds)
     noise = history.noises[-1] if history.noises else None

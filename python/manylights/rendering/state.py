@@ -21,12 +21,14 @@ class State:
         history: samples, noises and seconds so far.
         channels: names of the film's channels, empty before the first step.
         learnt: counts of what was learnt, integers (``Driver.learnt``).
+        processors: names of those that it was rendered on.
     """
 
     sums: list[Sums]
     history: History
     channels: list[str] = field(default_factory=list)
     learnt: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint32))
+    processors: list[str] = field(default_factory=list)
 
     @staticmethod
     def empty(sequences: int) -> State:
@@ -49,9 +51,10 @@ class State:
         if len(self.sums) > 1:
             total = Sums()
             total.merge(*self.sums)
-        return total.rounded / np.float32(self.history.spp) if adjoint else total.rounded
+        spp = np.float32(max(self.history.spp, 1))
+        return total.rounded / spp if adjoint else total.rounded
 
     def rough_total(self, adjoint: bool) -> np.ndarray:
         """Return the same in a hurry, for pictures on the way."""
         total = sum(sums.rounded for sums in self.sums if sums.parts is not None)
-        return total / np.float32(self.history.spp) if adjoint else total
+        return total / np.float32(max(self.history.spp, 1)) if adjoint else total

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass, field
 
 from manylights.rendering import plan as plans
+from manylights.rendering.parts import WHOLE, Part
 from manylights.rendering.plan import Limits, Step
 
 #: Variance falls with the number of samples to this power, at least and at most: what is measured
@@ -38,12 +39,14 @@ class Course:
         limits: for the sizes of steps.
         noise: the target, relative; ``None`` for none.
         seconds: the same for the time.
+        part: whose steps these are; those of all, as a rule.
     """
 
     spp: int
     limits: Limits
     noise: float | None = None
     seconds: float | None = None
+    part: Part = WHOLE
 
     @property
     def has_target(self) -> bool:
@@ -59,7 +62,18 @@ class Course:
         """Return the step after those that are done, None at the end."""
         if self.has_target:
             return self._towards_target(done)
-        return plans.step_at(done.steps, self.spp, self.limits)
+        return plans.step_at(self.part.step(done.steps), self.spp, self.limits)
+
+    @property
+    def step_count(self) -> int | None:
+        """How many steps all parts have together; None if nobody knows."""
+        return None if self.has_target else plans.step_count(self.spp, self.limits)
+
+    def training(self, done: History) -> Step | None:
+        """Return what a part has to learn from that others begin with, None if nothing."""
+        if self.has_target or self.part.step(0) == 0 or self.next_step(done) is None:
+            return None
+        return plans.training(self.spp, self.limits)
 
     def goal(self, noises: list[float]) -> tuple[int, bool]:
         """Return the samples of each sequence at the end of the round after these noises.
@@ -89,7 +103,7 @@ class Course:
     def predicted_spp(self, noises: list[float]) -> int:
         """Return the samples per pixel that there will be, as far as is known."""
         if not self.has_target:
-            return self.spp
+            return self._spp_of_part()
         goal, last = self.goal(noises)
         if last:
             return goal * self.sequences
@@ -98,6 +112,13 @@ class Course:
         before = self.goal(noises[:-1])[0]
         wanted = before * (noises[-1] / self.noise) ** 2
         return int(min(wanted * self.sequences, self.spp)) if wanted == wanted else self.spp
+
+    def _spp_of_part(self) -> int:
+        """Return the samples per pixel of its steps; all have the same but the last one."""
+        count = self.step_count
+        steps, size = self.part.steps(count), plans.step_size(self.spp, self.limits)
+        has_last = steps > 0 and self.part.step(steps - 1) == count - 1
+        return steps * size - (count * size - self.spp if has_last else 0)
 
     def _next_goal(self, goals: list[int], noises: list[float]) -> tuple[int, bool]:
         twice = 2 * goals[-1]

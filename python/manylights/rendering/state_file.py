@@ -1,0 +1,187 @@
+"""The file of a state: what a render has so far, as a checkpoint, as a part, or merged of parts.
+
+It is an OpenEXR image that any viewer shows: the picture so far in its own channels, the parts of
+the film's sums in channels of their own (``output.channels``), and in the attributes
+``manylights.*`` what was rendered and learnt, as JSON. It is written under another name and then
+renamed: whoever is killed while writing leaves the one before. Reading runs nothing: numbers and
+texts are parsed, and their sizes checked.
+
+Finished images have the attributes, too, but no sums.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from manylights.errors import UsageError, one_line
+from manylights.output import channels, exr, images
+from manylights.rendering.develop import WEIGHT, picture
+from manylights.rendering.job import FORMAT
+from manylights.rendering.parts import Part, Run
+from manylights.rendering.state import State
+from manylights.rendering.sums import PARTS, Sums
+from manylights.rendering.targets import History
+
+#: Prefix of the file's attributes.
+ATTRIBUTE = "manylights."
+
+#: What is learnt has 38 MB at most; more is no file of ours.
+MOST_LEARNT = 2**26
+
+#: More steps take longer than anybody waits.
+MOST_STEPS = 2**26
+
+
+@dataclass
+class Saved:
+    """What a file holds.
+
+    Attributes:
+        path: of the file.
+        facts: of the job (``Job.facts``), and others of the state.
+        runs: which steps there are.
+        state: ``None`` in a finished image.
+        shown: names of the channels of the image.
+        command: words of the command line that rendered it, without the part; empty if none did.
+    """
+
+    path: Path
+    facts: dict[str, Any]
+    runs: list[Run]
+    state: State | None
+    shown: list[str]
+    command: list[str]
+
+
+def write(saved: Saved) -> Path:
+    """Write a file with sums."""
+    state, facts = saved.state, saved.facts
+    summed = state.channels
+    shown = [index for index, name in enumerate(summed) if name != WEIGHT]
+    image = picture(state.rough_total(facts["adjoint"]), summed)[..., shown]
+    names, parts = [summed[index] for index in shown], [image]
+    for prefix, part in zip(channels.sums(len(state.sums)), _parts(state.sums)):
+        names += [prefix + name for name in summed]
+        parts.append(part)
+    bitmap = channels.join(names, *parts)
+    done = {"history": asdict(state.history), "channels": summed, "shown": saved.shown}
+    done |= {"learnt": _packed(state.learnt), "sequences": len(state.sums)}
+    done["runs"] = [[run.part.number, run.part.count, run.done] for run in saved.runs]
+    done |= {"processors": state.processors, "command": saved.command}
+    facts = {**facts, **done, "samples_done": state.history.spp}
+    facts["checksum"] = _checksum(facts, state.sums)
+    sign(bitmap, facts, state.history.spp)
+    return images.write_whole(bitmap, saved.path, mi.Bitmap.FileFormat.OpenEXR)
+
+
+def sign(bitmap, facts: dict[str, Any], samples: int) -> None:
+    """Write facts and the number of samples per pixel to the attributes of an image."""
+    for name, value in {**facts, "samples_done": samples}.items():
+        bitmap.metadata()[ATTRIBUTE + name] = json.dumps(value)
+
+
+def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
+    """Read a file of a state or a finished image, and return it and its bitmap.
+
+    Args:
+        path: the file.
+        prefix: what it should be, for messages: "checkpoint".
+        remedy: what to do about another one, for messages.
+
+    Raises:
+        UsageError: not such a file, or not a whole one.
+    """
+    try:
+        bitmap = channels.read(path)
+        facts = {
+            name[len(ATTRIBUTE) :]: exr.fact(value)
+            for name, value in bitmap.metadata().items()
+            if name.startswith(ATTRIBUTE)
+        }
+        if "samples_done" in facts:
+            return _saved(path, bitmap, facts), bitmap
+    except (UsageError, ValueError, KeyError, TypeError, AttributeError, zlib.error) as error:
+        what = f"{type(error).__name__}: " if isinstance(error, (KeyError, TypeError)) else ""
+        text = f"{path}: not a whole {prefix}{remedy} ({what}{one_line(error)})"
+        raise UsageError(text) from error
+    raise UsageError(f"{path}: not a {prefix} of manylights{remedy}")
+
+
+def _saved(path: Path, bitmap, facts: dict[str, Any]) -> Saved:
+    if facts["format"] != FORMAT:
+        version = facts.get("version")
+        raise ValueError(f"format {facts['format']} and not {FORMAT}, written by {version}")
+    steps = facts["step_count"]
+    if steps is not None and not 1 <= steps <= MOST_STEPS:
+        raise ValueError(f"{steps} steps")
+    if "channels" not in facts:
+        if not facts["seeds"] or not 1 <= facts["samples_done"] < 2**53:
+            raise ValueError(f"{facts['samples_done']} samples of the seeds {facts['seeds']}")
+        return Saved(path, facts, [], None, [], [])
+    runs = [_run(run, steps) for run in facts["runs"]]
+    state = _state(channels.split(bitmap), facts)
+    if _checksum(facts, state.sums) != facts["checksum"]:
+        raise ValueError("checksum")
+    command = [str(word) for word in facts["command"]]
+    return Saved(path, facts, runs, state, list(facts["shown"]), command)
+
+
+def _run(numbers: list[int], steps: int | None) -> Run:
+    number, count, done = numbers
+    part = Part.of((number, count))
+    if type(done) is not int or not 0 <= done <= (2**32 if steps is None else part.steps(steps)):
+        raise ValueError(f"{done} steps of {part.words()}")
+    return Run(part, done)
+
+
+def _state(found: dict[str, np.ndarray], facts: dict[str, Any]) -> State:
+    prefixes = channels.sums(facts["sequences"])
+    missing = [p + n for p in prefixes for n in facts["channels"] if p + n not in found]
+    if missing or not facts["channels"]:
+        raise ValueError(f"no channel {missing[0]}" if missing else "no channels")
+    parts = [
+        np.stack([found[prefix + name] for name in facts["channels"]], axis=-1)
+        for prefix in prefixes
+    ]
+    sums = [Sums(np.stack(parts[at : at + PARTS])) for at in range(0, len(parts), PARTS)]
+    history = History(**facts["history"])
+    if len(history.samples) != len(sums):
+        raise ValueError(f"{len(history.samples)} numbers of samples and {len(sums)} sequences")
+    learnt, processors = _unpacked(facts["learnt"]), list(facts["processors"])
+    return State(sums, history, list(facts["channels"]), learnt, processors)
+
+
+def _parts(sums: list[Sums]):
+    """Yield the parts of the sums of all sequences, zeros where there are none yet."""
+    zeros = np.zeros_like(sums[0].parts)
+    for one in sums:
+        yield from zeros if one.parts is None else one.parts
+
+
+def _checksum(facts: dict[str, Any], sums: list[Sums]) -> int:
+    """Return CRC-32 of facts and sums: files travel."""
+    facts = {name: value for name, value in facts.items() if name != "checksum"}
+    result = zlib.crc32(json.dumps(facts, sort_keys=True).encode())
+    for part in _parts(sums):
+        result = zlib.crc32(np.ascontiguousarray(part), result)
+    return result
+
+
+def _packed(counts: np.ndarray) -> str:
+    return base64.b64encode(zlib.compress(counts.astype("<u4").tobytes())).decode()
+
+
+def _unpacked(text: str) -> np.ndarray:
+    unpacker = zlib.decompressobj()
+    data = unpacker.decompress(base64.b64decode(text), MOST_LEARNT)
+    if not unpacker.eof:
+        raise ValueError("what was learnt does not end")
+    return np.frombuffer(data, "<u4").astype(np.uint32)
