@@ -15,7 +15,7 @@ import numpy as np
 
 from manylights.errors import UsageError
 from manylights.output import channels, images
-from manylights.rendering import state_file
+from manylights.rendering import metadata, state_file
 from manylights.rendering.develop import WEIGHT, develop
 from manylights.rendering.job import FILMS, STATE, differences
 from manylights.rendering.parts import gaps, steps_of
@@ -255,7 +255,7 @@ def _check_image(saved: Saved, names, first: Saved, expected, owners: dict[int, 
             "render first, then the images"
         )
     changes = differences(
-        saved.facts, first.facts, but=("part", "seed", "spp", "step_count", "steps")
+        saved.facts, first.facts, but=("part", "seed", "spp", "step_count", "steps", *metadata.OWN)
     )
     if changes:
         text = "; ".join(changes)

@@ -13,6 +13,9 @@ from manylights.output import exr
 #: Primaries and white of what Mitsuba calls RGB: those of ITU-R BT.709.
 CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 
+#: What :func:`attributes` adds to the facts of a job.
+OWN = ("samples", "seconds_taken", "parameters", "noise")
+
 #: Columns of names in what ``describe`` returns.
 INDENT = 20
 
