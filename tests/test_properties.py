@@ -503,7 +503,7 @@ class Scene:
             colour = rgb(self.colour(generator, power))
             return {"type": "point", "position": position.tolist(), "intensity": colour}
         if kind == "projector":
-            irradiance = stripes(1.0)
+            irradiance = stripes(power)
             return {"type": "projector", "to_world": frame, "irradiance": irradiance, "fov": 30.0}
         if kind.endswith("spot"):
             return self.spot(generator, kind, frame, rgb(self.colour(generator, power)))

@@ -146,9 +146,9 @@ def test_stage_looks_as_the_same_scene_by_hand(tmp_path):
 
     scene = usd.load(write_stage(tmp_path, BY_HAND))
     scene["integrator"] = {"type": "manylights_direct"}
-    stage = render_seeds(mi.load_dict(scene), spp=64, seeds=range(12))
+    stage = render_seeds(mi.load_dict(scene), spp=96, seeds=range(12))
     by_hand = scene_by_hand()
-    assert_same_mean(stage, render_seeds(mi.load_dict(by_hand), spp=64, seeds=range(12, 24)))
+    assert_same_mean(stage, render_seeds(mi.load_dict(by_hand), spp=96, seeds=range(12, 24)))
     del by_hand["sun"]
     with pytest.raises(AssertionError):
-        assert_same_mean(stage, render_seeds(mi.load_dict(by_hand), spp=64, seeds=range(12, 24)))
+        assert_same_mean(stage, render_seeds(mi.load_dict(by_hand), spp=96, seeds=range(12, 24)))

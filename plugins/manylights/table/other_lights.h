@@ -53,8 +53,12 @@ public:
     }
 
 private:
-    /// Some shapes of Mitsuba (curves) have no way to choose a point on them
+    /// Some shapes of Mitsuba (curves) have no way to choose a point on them. With a texture
+    /// B-spline curves pretend that they have: they read behind their last segment.
     bool can_sample(const Emitter *emitter) const {
+        const auto *shape = emitter->shape();
+        if (shape && shape->shape_type() == +mitsuba::ShapeType::BSplineCurve)
+            return false;
         try {
             SurfaceInteraction3f si = dr::zeros<SurfaceInteraction3f>();
             auto [ds, weight]       = emitter->sample_direction(si, Point2f(.5f), true);
