@@ -86,7 +86,7 @@ REFERENCES = {
     "paths": {"splitting_rate": 6, "learn_visibility": False},
 }
 #: With every light at each point a sample takes long, and fewer have the same noise.
-REFERENCE_SAMPLES = {"direct": 8, "paths": 32}
+REFERENCE_SAMPLES = {"direct": 8, "paths": 16}
 CASES = [f"{name}-{kind}" for name in SCENES for kind in INTEGRATORS]
 CASES.remove("fog-direct")  # it knows no media
 

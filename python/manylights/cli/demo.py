@@ -7,7 +7,7 @@ import mitsuba as mi
 from manylights import lights, loading, scenes
 from manylights.cli import options as shared
 from manylights.cli.render import render_to
-from manylights.loading import integrators
+from manylights.loading import integrators, samplers
 from manylights.output import images
 from manylights.progress import say
 
@@ -49,6 +49,7 @@ def _run(options) -> None:
         spp=spp,
         integrator={"type": integrators.DIRECT, "block_size": integrators.BLOCK_SIZE},
     )
+    description["sensor"]["sampler"]["type"] = samplers.SOBOL
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
     count = sum(lights.count_kinds(loaded.scene).values())
     say(f"lights: {count:,}")
