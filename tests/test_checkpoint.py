@@ -419,7 +419,7 @@ def test_checkpoints_are_written_when_it_is_time(wide, short_steps, monkeypatch,
         written.append(state.history.steps)
         now[0] += 3.0
 
-    monkeypatch.setattr(checkpoint.Checkpoint, "_write", write_slowly)
+    monkeypatch.setattr(checkpoint.Checkpoint, "write", write_slowly)
     kept = checkpoint.Checkpoint(tmp_path / "c.exr", job, 10.0, clock=lambda: now[0])
     for time_of_step in (9.0, 0.5, 1.0, 9.5, 0.6, 30.0):
         now[0] += time_of_step

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import platform
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 
 import manylights
 from manylights.loading import has_backend
+from manylights.threads import processor
 
 #: Packages whose version may matter; those that are not installed are named, too.
 PACKAGES = ("numpy", "usd-core", "OpenEXR", "mitsuba-oidn", "distributed")
@@ -32,7 +31,7 @@ def describe(verbose: bool) -> str:
         "plugins": manylights.plugin_dir(),
         "variants": ", ".join(compiled_variants()),
         "LLVM": _llvm(),
-        "CPU": f"{_cpu()}, {dr.thread_count()} threads",
+        "CPU": f"{processor()}, {dr.thread_count()} threads",
         "GPU": _gpu(),
     }
     return "\n".join(f"{name + ':':<12}{text}" for name, text in lines.items())
@@ -66,14 +65,6 @@ def _llvm() -> str:
         return "none found"
     version = ".".join(map(str, dr.detail.llvm_version()))
     return version if has_backend(dr.JitBackend.LLVM) else f"{version}, too old to be used"
-
-
-def _cpu() -> str:
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def _gpu() -> str:

@@ -84,7 +84,7 @@ class Checkpoint:
         if self.clock() - self.last < self.seconds:
             return
         try:
-            self._write(state)
+            self.write(state)
             self.samples = state.history.spp
         except Exception as error:
             say(f"no checkpoint written, the render goes on: {one_line(error)}")
@@ -96,11 +96,8 @@ class Checkpoint:
         self.path.unlink(missing_ok=True)
         files.remove_leftovers(self.path)
 
-    def finish(self, state: State) -> None:
-        """Write the state at the end of a part, however long ago the last time was."""
-        self._write(state)
-
-    def _write(self, state: State) -> None:
+    def write(self, state: State) -> None:
+        """Write the state, however long ago the last time was."""
         part = self.job.course.part
         name = processor()
         state.processors += [] if name in state.processors else [name]

@@ -20,11 +20,16 @@ OWN = ("samples", "seconds_taken", "parameters", "noise")
 INDENT = 20
 
 
-def attributes(job, result) -> dict[str, Any]:
+def attributes(job, result, software: str) -> dict[str, Any]:
     """Return the attributes of the file of ``result`` (``RenderResult``) by name.
 
     Those of the OpenEXR standard have its names, others begin with ``manylights.``. The facts of
     the job are not among them (``state_file.sign``).
+
+    Args:
+        job: what was rendered.
+        result: its ``RenderResult``.
+        software: the versions, as the facts of the job have them.
     """
     own = {
         "samples": result.samples,
@@ -34,7 +39,7 @@ def attributes(job, result) -> dict[str, Any]:
     if result.noise is not None:
         own["noise"] = result.noise
     return {
-        "software": job.facts()["version"],
+        "software": software,
         "chromaticities": CHROMATICITIES,
         **camera_matrices(job.driver.sensor),
         **{exr.OURS + name: value for name, value in own.items()},

@@ -156,11 +156,12 @@ def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -
     result = result_of(job, state)
     if target is not None and job.part is not None:
         path = part_path(target, job.part)
-        Checkpoint(path, job, facts=facts).finish(state)
+        Checkpoint(path, job, facts=facts).write(state)
         result.files = [path]
     elif target is not None:
         state_file.sign(result.bitmap, {**facts, "seeds": [job.seed]}, result.samples)
-        layers, attributes = variance_layers(result), metadata.attributes(job, result)
+        layers = variance_layers(result)
+        attributes = metadata.attributes(job, result, facts["version"])
         number = images.number_of(job.film)
         result.files, notes = images.write_images(result.bitmap, target, layers, attributes, number)
         result.notes += notes

@@ -30,9 +30,6 @@ from manylights.rendering.state import State
 from manylights.rendering.sums import PARTS, Sums
 from manylights.rendering.targets import History
 
-#: Prefix of the file's attributes.
-ATTRIBUTE = "manylights."
-
 #: What is learnt has 38 MB at most; more is no file of ours.
 MOST_LEARNT = 2**26
 
@@ -85,7 +82,7 @@ def write(saved: Saved) -> Path:
 def sign(bitmap, facts: dict[str, Any], samples: int) -> None:
     """Write facts and the number of samples per pixel to the attributes of an image."""
     for name, value in {**facts, "samples_done": samples}.items():
-        bitmap.metadata()[ATTRIBUTE + name] = json.dumps(value)
+        bitmap.metadata()[exr.OURS + name] = json.dumps(value)
 
 
 def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
@@ -102,9 +99,9 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
     try:
         bitmap = channels.read(path)
         facts = {
-            name[len(ATTRIBUTE) :]: exr.fact(value)
+            name[len(exr.OURS) :]: exr.fact(value)
             for name, value in bitmap.metadata().items()
-            if name.startswith(ATTRIBUTE)
+            if name.startswith(exr.OURS)
         }
         if "samples_done" in facts:
             return _saved(path, bitmap, facts), bitmap
