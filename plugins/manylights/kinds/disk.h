@@ -74,13 +74,8 @@ struct DiskLight {
     static LightPoint<Float> sample(const Row<Float> &row,
                                     const typename Row<Float>::Point3f &x,
                                     const typename Row<Float>::Point2f &u) {
-        using Point3f = mitsuba::Point<Float, 3>;
-        auto b        = mitsuba::warp::square_to_uniform_disk_concentric(u);
-        Point3f p     = row.vector(0) + b.x() * row.vector(3) + b.y() * row.vector(6);
-        LightPoint<Float> result =
-            surface_point<Float>(p, flat_pdf<Float>(row, dr::Pi<float>, p - x));
-        result.uv = b;
-        return result;
+        return flat_point<Float>(
+            row, x, mitsuba::warp::square_to_uniform_disk_concentric(u), dr::Pi<float>);
     }
 
     template <typename Float>

@@ -62,12 +62,10 @@ LightPoint<Float> surface_point(const mitsuba::Point<Float, 3> &p, const Float &
     return result;
 }
 
-// --------------------------------------------------------------------------- Without extent
+// --------------------------------------------------------------------------- Without surface
 
-/// What kinds without extent have in common: no ray hits them
-struct DeltaLight {
-    static constexpr bool is_delta = true;
-
+/// What kinds have in common of whose surface the table knows nothing
+struct WithoutSurface {
     template <typename Float>
     static mitsuba::Vector<Float, 3> normal(const Row<Float> &,
                                             const typename Row<Float>::Point3f &) {
@@ -80,6 +78,11 @@ struct DeltaLight {
                      const typename Row<Float>::Vector3f &) {
         return 0.f;
     }
+};
+
+/// What kinds without extent have in common: no ray hits them
+struct DeltaLight : WithoutSurface {
+    static constexpr bool is_delta = true;
 };
 
 /// The place of a light, whose intensity times `weight` arrives
@@ -114,6 +117,19 @@ Float flat_pdf(const Row<Float> &row, float unit_area,
     auto normal  = dr::cross(row.vector(3), row.vector(6));
     Float length = dr::norm(normal);
     return area_to_solid_angle<Float>(length * unit_area, w, normal / length, two_sided);
+}
+
+/// The point of a triangle or a disk with the coordinates `b` along its edges or axes
+template <typename Float>
+LightPoint<Float> flat_point(const Row<Float> &row, const typename Row<Float>::Point3f &x,
+                             const typename Row<Float>::Point2f &b, float unit_area,
+                             const dr::mask_t<Float> &two_sided = false) {
+    using Point3f = mitsuba::Point<Float, 3>;
+    Point3f p     = row.vector(0) + b.x() * row.vector(3) + b.y() * row.vector(6);
+    LightPoint<Float> result =
+        surface_point<Float>(p, flat_pdf<Float>(row, unit_area, p - x, two_sided));
+    result.uv = b;
+    return result;
 }
 
 /// Intensity of a flat emitter of area vector `a` (length: area) seen along w

@@ -13,7 +13,7 @@ namespace manylights {
 /// Any other emitter of finite extent (a projector, an exotic shape) as a whole: its own plugin
 /// chooses points on it, and has their density and normals. Its row: mean position[3], variance
 /// of the position; its brightness: flux / (4 pi)
-struct OtherLight {
+struct OtherLight : WithoutSurface {
     static constexpr LightKind kind = LightKind::Other;
     static constexpr bool is_delta  = false;
 
@@ -104,19 +104,6 @@ struct OtherLight {
                                     const typename Row<Float>::Point3f &,
                                     const typename Row<Float>::Point2f &) {
         return dr::zeros<LightPoint<Float>>();
-    }
-
-    template <typename Float>
-    static mitsuba::Vector<Float, 3> normal(const Row<Float> &,
-                                            const typename Row<Float>::Point3f &) {
-        return 0.f;
-    }
-
-    template <typename Float>
-    static Float pdf(const Row<Float> &, const typename Row<Float>::Point3f &,
-                     const typename Row<Float>::Point3f &,
-                     const typename Row<Float>::Vector3f &) {
-        return 0.f;
     }
 };
 

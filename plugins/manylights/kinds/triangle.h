@@ -95,13 +95,8 @@ struct TriangleLight {
     static LightPoint<Float> sample(const Row<Float> &row,
                                     const typename Row<Float>::Point3f &x,
                                     const typename Row<Float>::Point2f &u) {
-        using Point3f = mitsuba::Point<Float, 3>;
-        auto b        = mitsuba::warp::square_to_uniform_triangle(u);
-        Point3f p     = row.vector(0) + b.x() * row.vector(3) + b.y() * row.vector(6);
-        LightPoint<Float> result =
-            surface_point<Float>(p, direction_pdf<Float>(row, p - x));
-        result.uv = b;
-        return result;
+        return flat_point<Float>(row, x, mitsuba::warp::square_to_uniform_triangle(u),
+                                 .5f, row.two_sided());
     }
 
     template <typename Float>
@@ -114,14 +109,7 @@ struct TriangleLight {
     static Float pdf(const Row<Float> &row, const typename Row<Float>::Point3f &x,
                      const typename Row<Float>::Point3f &p,
                      const typename Row<Float>::Vector3f &) {
-        return direction_pdf<Float>(row, p - x);
-    }
-
-private:
-    template <typename Float>
-    static Float direction_pdf(const Row<Float> &row,
-                               const typename Row<Float>::Vector3f &w) {
-        return flat_pdf<Float>(row, .5f, w, row.two_sided());
+        return flat_pdf<Float>(row, .5f, p - x, row.two_sided());
     }
 };
 
