@@ -98,11 +98,13 @@ def test_unbiased(variant, case):
     name, kind = case.split("-")
     scene = mi.load_dict(SCENES[name]())
     reference = integrator(kind, **REFERENCES[kind])
-    expected = images(scene, reference, range(100, 112), REFERENCE_SAMPLES[kind])
-    tools.assert_same_mean(images(scene, integrator(kind)), expected, label=f"{case}, learning")
+    seeds = range(8)  # find half of the bias that has to be found
+    expected = images(scene, reference, range(100, 108), REFERENCE_SAMPLES[kind])
+    learnt = images(scene, integrator(kind), seeds)
+    tools.assert_same_mean(learnt, expected, label=f"{case}, learning")
     kept = integrator(kind, learn_visibility="keep")
     render(scene, kept, seed=99)
-    tools.assert_same_mean(images(scene, kept), expected, label=f"{case}, kept")
+    tools.assert_same_mean(images(scene, kept, seeds), expected, label=f"{case}, kept")
 
 
 def test_bias_is_noticed(llvm):
