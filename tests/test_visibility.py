@@ -150,6 +150,21 @@ def test_same_seed_same_bits(variant, kind, thread_count):
     assert np.array_equal(expected, render(scene, integrator(kind)))
 
 
+@pytest.mark.parametrize("kind", INTEGRATORS)
+def test_all_seeds_take_the_same_kernels(llvm, kind):
+    """The seed says which pixels train: as a number, and not as a part of the kernels."""
+    scene, method = mi.load_dict(hidden_points()), integrator(kind)
+
+    def kernels(seed):
+        dr.kernel_history_clear()
+        render(scene, method, seed)
+        return {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        kernels(0)  # what is made of the scene once has kernels, too
+        assert kernels(1) == kernels(2)
+
+
 def test_overlapping_renderings(scalar):
     """Two threads get the images that they get one after the other."""
     scenes = [mi.load_dict(hidden_points()) for _ in range(2)]
