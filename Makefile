@@ -9,6 +9,10 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check
 # Extra arguments for pytest, as in: make test ARGS="-k tree -x"
 ARGS ?=
 
+# One process of tests for each core; which test runs where makes no difference.
+# In this one, to see output at once or for a debugger: make test ARGS="-n 0 -s -k tree"
+IN_PARALLEL := -n auto --maxprocesses 8 --dist worksteal
+
 # Object files stay here between builds. Ninja uses all cores; to use fewer, set the
 # environment variable CMAKE_BUILD_PARALLEL_LEVEL.
 BUILD_DIR := build/make
@@ -40,11 +44,11 @@ build: $(INSTALLED)  ## Compile the plugins and install the package into .venv
 
 .PHONY: test
 test: $(INSTALLED)  ## Run the quick tests
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest $(IN_PARALLEL) $(ARGS)
 
 .PHONY: test-slow
 test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
-	$(BIN)/python -m pytest -m slow $(ARGS)
+	$(BIN)/python -m pytest $(IN_PARALLEL) -m slow $(ARGS)
 
 # Other seeds and variants: make soak ARGS="2000 --seed 50000 --variant llvm_ad_rgb"
 .PHONY: soak

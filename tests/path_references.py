@@ -96,6 +96,6 @@ def known_images(name, variant, sensor=0, **parameters):
         set_power_weights(scene)
         integrator = known(name, **{"max_depth": depth_of(name), **parameters})
         error = ERROR["uniform"]
-        return planned_images(scene, integrator, error, first_seed=100_000, sensor=sensor)
+        return planned_images(scene, integrator, error, 100_000, sensor, known=True)
     finally:
         mi.set_variant(before)

@@ -21,15 +21,27 @@ from manylights.loading import has_backend
 from tests import light_scenes
 from tests import statistics_tools as tools
 
-SEEDS = 32
-"""Renderings per estimate: enough degrees of freedom for the t test's far tail to be short."""
+SEEDS = 24
+"""Renderings of the integrator under test: each of them records its kernels again."""
 
-ERROR = {"uniform": 1.4e-3, "power": 1.4e-3, "bsdf": 1.4e-3, "exhaustive": 1e-3, "tested": 1.5e-3}
+REFERENCE_SEEDS = 64
+"""Images of a reference, which are rendered together; they keep the t test's far tail short."""
+
+PILOTS = 8
+"""Short renderings that tell how many samples are needed."""
+
+ERROR = {
+    "uniform": 1.3e-3,
+    "power": 1.3e-3,
+    "bsdf": 1.3e-3,
+    "exhaustive": 1.1e-3,
+    "tested": 1.35e-3,
+}
 """Relative standard error of the image mean that the number of samples is chosen for.
 
 To find a bias of 2 % with `tools.SIGNIFICANCE` and `tools.POWER` the difference may have one of
-0.25 % (8 standard errors with 40 to 60 degrees of freedom); the noisiest pair here has 0.21 %, and
-mostly less, since the pilot over-estimates the variance.
+0.26 % (7.7 standard errors with some 50 degrees of freedom), or 0.22 % against a closed form. The
+noisiest pair here has 0.19 %: half of that variance, since the one of few renderings varies.
 """
 
 LLVM_TWIN = {
@@ -45,18 +57,73 @@ def reference_variant(variant):
     return twin if has_llvm else variant
 
 
-def planned_images(scene, integrator, error, first_seed, sensor=0):
-    """Render `SEEDS` images with as many samples as the relative `error` of their mean needs.
+def planned_images(scene, integrator, error, first_seed, sensor=0, known=False):
+    """Render as many images and samples as the relative `error` of their mean needs.
 
-    Numbers of samples are odd: LLVM variants compile one kernel for powers of two and another one
-    for all other numbers.
+    `known` integrators are not under test: they need not render as users do. Numbers of samples are
+    odd: LLVM variants compile one kernel for powers of two and another one for all other numbers.
     """
-    pilot_spp = 5
-    pilot_seeds = range(first_seed, first_seed + 16)
-    pilot = tools.render_seeds(scene, integrator, pilot_spp, pilot_seeds, sensor)
-    spp = tools.samples_for_precision(pilot, pilot_spp, SEEDS, error)
-    seeds = range(first_seed + 1000, first_seed + 1000 + SEEDS)
-    return tools.render_seeds(scene, integrator, max(pilot_spp, spp | 1), seeds, sensor)
+    render = render_at_once if known else tools.render_seeds
+    count = REFERENCE_SEEDS if known else SEEDS
+    pilot_spp = 9
+    pilot = render(scene, integrator, pilot_spp, range(first_seed, first_seed + PILOTS), sensor)
+    spp = tools.samples_for_precision(
+        pilot,
+        pilot_spp,
+        count,
+        error,
+        independent_pixels=has_independent_pixels(scene.sensors()[sensor]),
+    )
+    seeds = range(first_seed + 1000, first_seed + 1000 + count)
+    return render(scene, integrator, max(5, spp | 1), seeds, sensor)
+
+
+def has_independent_pixels(sensor):
+    """True if each sample counts in one pixel."""
+    return sensor.film().rfilter().radius() < 0.51
+
+
+WAVEFRONT = 1 << 21
+"""Most samples that are traced at once: 100 MB of random numbers and what an integrator keeps."""
+
+
+def render_at_once(scene, integrator, spp, seeds, sensor=0):
+    """Images as `tools.render_seeds` makes them, in JIT variants in few wavefronts.
+
+    For integrators of Mitsuba and in Python, most of whose time goes into recording small renders.
+    Each sample has random numbers of its own, so images are independent as those of seeds are. The
+    first seed of a wavefront stands for all.
+    """
+    if mi.variant().startswith("scalar"):
+        return tools.render_seeds(scene, integrator, spp, seeds, sensor)
+    sensor = scene.sensors()[sensor]
+    width, height = sensor.film().crop_size()
+    share = min(REFERENCE_SEEDS, max(1, int(WAVEFRONT // (width * height * spp))))
+    parts = [seeds[start : start + share] for start in range(0, len(seeds), share)]
+    images = [wavefront(scene, integrator, spp, part[0], len(part), sensor) for part in parts]
+    return np.concatenate(images)
+
+
+def wavefront(scene, integrator, spp, seed, count, sensor):
+    """`count` images whose samples are traced together, on a film that has one below the other.
+
+    One kernel serves any number of samples and images: its numbers are opaque, its film has a size.
+    """
+    width, height = (int(value) for value in sensor.film().crop_size())
+    samples = width * height * spp * count
+    sampler = sensor.sampler().clone()
+    sampler.seed(dr.opaque(mi.UInt32, seed), samples)
+    pixel = dr.arange(mi.UInt32, samples) // dr.opaque(mi.UInt32, spp)
+    place = mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()
+    top = mi.Float(pixel // (width * height) * height)
+    on_film = mi.Point2f(place.x / width, (place.y - top) / height)
+    ray, weight = sensor.sample_ray_differential(0.0, sampler.next_1d(), on_film, sampler.next_2d())
+    value, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
+    box = mi.load_dict({"type": "box"})
+    block = mi.ImageBlock((width, height * REFERENCE_SEEDS), (0, 0), 5, rfilter=box)
+    block.put(place, ray.wavelengths, weight * value, dr.select(valid, mi.Float(1), 0))
+    sums = np.array(block.tensor(), dtype=np.float64).reshape(-1, height, width, 5)[:count]
+    return sums[..., : 1 if mi.is_monochromatic else 3] / spp
 
 
 def set_power_weights(scene, samples=64):
@@ -125,6 +192,6 @@ def reference_images(name, kind, variant, bsdf_samples=1, hide_emitters=False):
         if kind == "power":
             set_power_weights(scene)
         integrator = make_reference(kind, bsdf_samples, hide_emitters)
-        return planned_images(scene, integrator, ERROR[kind], first_seed=100_000)
+        return planned_images(scene, integrator, ERROR[kind], first_seed=100_000, known=True)
     finally:
         mi.set_variant(before)

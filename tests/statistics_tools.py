@@ -233,23 +233,35 @@ def assert_same_mean(
     return comparison
 
 
-def samples_for_precision(pilot, spp, seeds, error, largest=1 << 14):
+def samples_for_precision(pilot, spp, seeds, error, largest=1 << 14, independent_pixels=False):
     """Samples per pixel that give the image mean a relative standard error of `error`.
 
     `pilot` are renderings with `spp` samples, not used for anything else: a sample size that
-    depends on the compared data themselves would bias the test.
+    depends on the compared data themselves would bias the test. `independent_pixels` says that no
+    sample counts in two pixels: the variance is then known from fewer renderings.
     """
-    means = image_means(pilot)
-    average = np.abs(means.mean(axis=0))
+    average = np.abs(image_means(pilot).mean(axis=0))
     lit = average > 0
     if not lit.any():
         return spp
+    observations = pilot if independent_pixels else image_means(pilot)[:, np.newaxis, np.newaxis]
+    variance, dof = variance_of_pixel_sum(observations)
+    variance = variance[lit] / observations[0, ..., 0].size ** 2
     # The upper end of a one-sided 90 % interval of the variance: pilots are short.
-    dof = len(means) - 1
-    variance = means.var(axis=0, ddof=1) * dof / stats.chi2.ppf(0.1, dof)
-    relative = np.max(variance[lit] / average[lit] ** 2)
-    needed = max(1.0, spp * relative / (seeds * error**2))
+    relative = variance * dof[lit] / stats.chi2.ppf(0.1, dof[lit]) / average[lit] ** 2
+    needed = max(1.0, spp * np.max(relative) / (seeds * error**2))
     return int(min(largest, np.ceil(needed)))
+
+
+def variance_of_pixel_sum(images):
+    """Variance of the sum of independent pixels, and its degrees of freedom, for each channel.
+
+    They are those of Satterthwaite: few where few pixels have nearly all of the variance.
+    """
+    pixels = images.var(axis=0, ddof=1)
+    variance, squares = pixels.sum(axis=(0, 1)), (pixels**2).sum(axis=(0, 1))
+    dof = np.divide(variance**2, squares, out=np.ones_like(variance), where=squares > 0)
+    return variance, dof * (len(images) - 1)
 
 
 @dataclass(frozen=True)

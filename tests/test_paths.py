@@ -105,7 +105,7 @@ def assert_reference_agrees(name, other):
     integrator = mi.load_dict({"type": other, "max_depth": depth_of(name)})
     scene = path_scenes.load(name)
     set_power_weights(scene)
-    images = planned_images(scene, integrator, ERROR["uniform"], first_seed=200_000)
+    images = planned_images(scene, integrator, ERROR["uniform"], 200_000, known=True)
     tools.assert_same_mean(images, known_images(name, mi.variant()), label=f"{name}, {other}")
 
 
@@ -453,7 +453,8 @@ def test_planted_bias_of_one_light_is_found(llvm, name):
     light, lights = "point_7", path_scenes.SCENES[name]()
     reference = known_images(name, llvm)
     only = {key: value for key, value in lights.items() if key == light or not is_light(value)}
-    share = planned_images(mi.load_dict(only), known(name, max_depth=MAX_DEPTH), 2e-3, 500_000)
+    alone = known(name, max_depth=MAX_DEPTH)
+    share = planned_images(mi.load_dict(only), alone, 2e-3, 500_000, known=True)
     factor = 1 + 0.02 * reference.mean() / share.mean()
     lights[light] = scaled(lights[light], factor, ("intensity",))
     with pytest.raises(AssertionError, match="significance"):

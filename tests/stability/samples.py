@@ -96,6 +96,6 @@ def reference_images(name, variant):
             known, error = mi.load_dict({"type": "volpath", **case.parameters}), ERROR["uniform"]
         else:
             known, error = make_reference("exhaustive"), ERROR["exhaustive"]
-        return planned_images(scene, known, error, first_seed=100_000)
+        return planned_images(scene, known, error, first_seed=100_000, known=True)
     finally:
         mi.set_variant(before)

@@ -1,5 +1,7 @@
 """The mean of every case equals that of an independent estimate, and nothing is NaN or black."""
 
+import functools
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -90,6 +92,7 @@ def test_mean_with_one_sample_per_pixel(llvm, name):
 UNITS = (1e-4, 1e-2, 1e2, 1e5)
 
 
+@functools.cache
 def noise(scale):
     """Relative variance of a sample in units of that scale, once for each seed."""
     values = samples.brightness(units(scale)(), mi.load_dict({"type": "manylights_direct"}))

@@ -32,7 +32,11 @@ public:
     /// @param seed  of the rendering: what trains is the same in all of its passes
     PixelSet(uint32_t width, uint32_t height, Role role, const UInt32 &seed)
         : m_width(width), m_height(height), m_columns((width + kSide - 1) / kSide),
-          m_role(role), m_seed(seed) {}
+          m_role(role), m_seed(seed) {
+        // One kernel for all seeds
+        if (role != Role::All)
+            dr::make_opaque(m_seed);
+    }
 
     /// How many numbers there are
     uint32_t size() const {
