@@ -421,6 +421,30 @@ def test_another_mitsuba_is_refused_with_the_command(version):
     )
 
 
+RELEASES = """
+import manylights, mitsuba
+for mitsuba.__version__ in ("3.9.1", "3.10.0"):
+    print(manylights.plugin_dir())
+mitsuba.__version__ = "3.11.0"
+manylights.plugin_dir()
+"""
+
+
+def test_plugins_of_the_installed_mitsuba_are_chosen(tmp_path):
+    """Of several releases in one package; one that is not there is refused, naming those."""
+    for release in ("3.10.0", "3.9.1"):
+        folder = tmp_path / f"mitsuba-{release}" / "plugins"
+        folder.mkdir(parents=True)
+        for name in PLUGINS:
+            (folder / f"{name}.so").write_bytes(b"")
+    process = python(RELEASES, MANYLIGHTS_PLUGIN_DIR=str(tmp_path))
+    assert process.stdout.split() == [str(tmp_path / f"mitsuba-{r}") for r in ("3.9.1", "3.10.0")]
+    assert last_line(process) == (
+        "ImportError: manylights is compiled for Mitsuba 3.9.1 and 3.10.0, but Mitsuba 3.11.0 is "
+        "installed. Get the matching one with: pip install mitsuba==3.10.0"
+    )
+
+
 def test_missing_mitsuba_is_refused_with_the_command():
     """The import says what to type."""
     process = python(IMPORT.format("sys.modules['mitsuba'] = None"))
@@ -506,11 +530,15 @@ def command(*arguments):
 # ----------------------------------------------------------------------------- broken installations
 
 
+#: Folder of the plugins for the Mitsuba that is installed
+RELEASE = f"mitsuba-{mi.__version__}"
+
+
 @pytest.mark.parametrize("present", [[], *([name] for name in PLUGINS)], ids=str)
 def test_incomplete_folder_of_plugins_is_named(tmp_path, present):
     """The folder, the variable that chose it, what is missing and what to type."""
-    folder = tmp_path / "plugins"
-    folder.mkdir()
+    folder = tmp_path / RELEASE / "plugins"
+    folder.mkdir(parents=True)
     for name in present:
         (folder / f"{name}.so").write_bytes(b"")
     missing = ", ".join(name for name in PLUGINS if name not in present)
@@ -523,8 +551,8 @@ def test_incomplete_folder_of_plugins_is_named(tmp_path, present):
 
 def test_file_that_is_no_plugin_is_named(tmp_path):
     """Mitsuba's message has the file and the reason."""
-    folder = tmp_path / "plugins"
-    folder.mkdir()
+    folder = tmp_path / RELEASE / "plugins"
+    folder.mkdir(parents=True)
     for name in PLUGINS:
         (folder / f"{name}.so").write_text("text")
     process = python(LOAD, MANYLIGHTS_PLUGIN_DIR=str(tmp_path))
