@@ -38,6 +38,16 @@ demo: $(DEMO_INSTALLED)  ## Render a city with more than 10,000 lights to demo.e
 .PHONY: build
 build: $(INSTALLED)  ## Compile the plugins and install the package into .venv
 
+# Its objects are not those of other builds, which need not have all variants.
+.PHONY: wheel
+wheel: $(VENV)/.wheel-tools  ## Build a wheel with all variants into dist/, and try it out
+	@echo "Compiling the plugins for all variants. The first time takes some minutes."
+	@rm -rf build/wheel/built && mkdir -p dist
+	MANYLIGHTS_WHEEL=1 $(PIP) wheel --quiet --no-build-isolation --no-deps \
+	  -C build-dir=build/wheel/objects --wheel-dir build/wheel/built .
+	PATH="$(abspath $(BIN)):$$PATH" ext/repair-wheel build/wheel/built/*.whl dist
+	$(BIN)/python tests/try_wheel.py "$$(ls -t dist/*.whl | head -n 1)" $(ARGS)
+
 .PHONY: test
 test: $(INSTALLED)  ## Run the quick tests
 	$(BIN)/python -m pytest $(ARGS)
@@ -119,6 +129,10 @@ build/.system-packages: ext/missing-packages
 
 $(VENV)/.build-tools: pyproject.toml | build/.system-packages $(VENV)/.created
 	$(PIP) install --quiet --group build
+	@touch $@
+
+$(VENV)/.wheel-tools: $(VENV)/.build-tools
+	$(PIP) install --quiet --group wheel
 	@touch $@
 
 # Without build isolation the paths of the headers stay the same, and with them the objects.
