@@ -14,7 +14,7 @@ ARGS ?=
 BUILD_DIR := build/make
 
 SOURCES  := CMakeLists.txt pyproject.toml \
-            $(shell find ext plugins python -type f -not -name '*.pyc')
+            $(shell find ext plugins python/manylights -type f -not -name '*.pyc')
 CPP_DIRS := $(wildcard ext plugins tests)
 
 # The package is installed again when a source file or the choice of variants changes: the
@@ -94,6 +94,10 @@ bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
 microbench: $(INSTALLED) $(VENV)/.dev-tools  ## Time building, traversal and resampling alone (a minute) into microbench.json
 	$(BIN)/python -m pytest tests/bench_tree.py --benchmark-json=microbench.json $(ARGS)
 
+.PHONY: docs
+docs: $(DEMO_INSTALLED) $(VENV)/.docs-tools  ## Build the documentation into build/docs/html
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/doctrees python/docs build/docs/html
+
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling
 	$(BIN)/ruff check python tests
@@ -129,6 +133,10 @@ build/.system-packages: ext/missing-packages
 
 $(VENV)/.build-tools: pyproject.toml | build/.system-packages $(VENV)/.created
 	$(PIP) install --quiet --group build
+	@touch $@
+
+$(VENV)/.docs-tools: pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --group docs
 	@touch $@
 
 $(VENV)/.wheel-tools: $(VENV)/.build-tools
