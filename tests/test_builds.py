@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests import statistics_tools as tools
+from tests import try_wheel
 
 SOURCE = Path(__file__).parents[1]
 PLUGINS = sorted(path.stem for path in (SOURCE / "plugins").glob("manylights_*.cpp"))
@@ -173,6 +175,37 @@ def write_toolchain(folder, processor):
         "set(CMAKE_TRY_COMPILE_TARGET_TYPE STATIC_LIBRARY)\n"
     )
     return f"-DCMAKE_TOOLCHAIN_FILE={path}"
+
+
+# ------------------------------------------------------------------------------------------ wheel
+
+LIBRARIES = ["libmanylights", *PLUGINS]
+
+
+@pytest.mark.parametrize(
+    ("tag", "names", "content", "said"),
+    [
+        ("py3-none", LIBRARIES, b"\0$ORIGIN\0/s\0 /a/b\0", None),
+        ("py3-none", LIBRARIES, b"\0/home/me/site-packages\0", "names ['/home/me/site-packages']"),
+        ("cp311-cp311", LIBRARIES, b"", "names a version of Python"),
+        ("py3-none", LIBRARIES[1:], b"", "its libraries are"),
+        ("py3-none", [*LIBRARIES, "../../_core"], b"", "_core.so is in it"),
+        ("py3-none", LIBRARIES, os.urandom(try_wheel.MOST_BYTES), "more than 10 MB"),
+    ],
+    ids=["good", "place", "tag", "missing", "core", "size"],
+)
+def test_faults_of_a_wheel_are_found(tmp_path, tag, names, content, said):
+    wheel = tmp_path / f"manylights-0.1.0-{tag}-linux_x86_64.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name in names:
+            folder = "manylights/mitsuba-3.9.1/plugins"
+            archive.writestr(os.path.normpath(f"{folder}/{name}.so"), content)
+            content = content[:100]
+    if said is None:
+        try_wheel.look_into(wheel)
+        return
+    with pytest.raises(SystemExit, match=re.escape(said)):
+        try_wheel.look_into(wheel)
 
 
 # ------------------------------------------------------------------------------------ full builds

@@ -14,6 +14,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import time
 import venv
 import zipfile
 from pathlib import Path
@@ -127,7 +128,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         here = Environment(Path(folder))
         # pip itself may need programs, as git
+        begin = time.perf_counter()
         here.run("pip", "install", options.wheel.resolve(), path=os.environ["PATH"])
+        print(f"installed with all that it needs in {time.perf_counter() - begin:.0f} s")
         print(here.run("manylights", "--version", "--verbose").strip())
         plugins = here.run("manylights", "plugin-dir").strip()
         (here.folder / "scene.xml").write_text(SCENE)
