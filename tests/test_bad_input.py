@@ -390,10 +390,10 @@ def test_paths_warn_of_lights_without_sense(scalar, warnings):
 # ----------------------------------------------------------------------- other Mitsubas, no libLLVM
 
 
-def python(script, **environment):
+def python(script, *arguments, **environment):
     """Run a script in a new process at the top of the sources."""
     return subprocess.run(
-        [sys.executable, "-c", script],
+        [sys.executable, "-c", script, *arguments],
         cwd=SOURCE,
         env={**os.environ, **environment},
         capture_output=True,
@@ -443,6 +443,25 @@ def test_plugins_of_the_installed_mitsuba_are_chosen(tmp_path):
         "ImportError: manylights is compiled for Mitsuba 3.9.1 and 3.10.0, but Mitsuba 3.11.0 is "
         "installed. Get the matching one with: pip install mitsuba==3.10.0"
     )
+
+
+EDITABLE = """
+import os, sys, sysconfig, manylights
+os.environ.pop("MANYLIGHTS_PLUGIN_DIR", None)
+manylights.__path__ = [sys.argv[1]]
+sysconfig.get_path = lambda name: sys.argv[2]
+print(manylights.plugin_dir())
+"""
+
+
+def test_plugins_of_an_editable_installation_are_found(tmp_path):
+    """Sources in one folder, plugins where packages are installed."""
+    folder = tmp_path / "manylights" / f"mitsuba-{mi.__version__}"
+    (folder / "plugins").mkdir(parents=True)
+    for name in PLUGINS:
+        (folder / "plugins" / f"{name}.so").write_bytes(b"")
+    process = python(EDITABLE, str(tmp_path / "sources"), str(tmp_path))
+    assert process.stdout.strip() == str(folder), process.stderr
 
 
 def test_missing_mitsuba_is_refused_with_the_command():

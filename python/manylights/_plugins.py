@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import sys
+import sysconfig
+from collections.abc import Iterable
 from pathlib import Path
 
 #: The Mitsuba release that this version is made for. Plugins fit one release, since its C++
@@ -22,9 +24,9 @@ def plugin_dir() -> str:
     """Return the folder to give to ``mitsuba -a``: the one that holds ``plugins/``.
 
     It is ``mitsuba-3.9.1`` in the package, with the release of the Mitsuba that is installed. An
-    editable installation spreads the package over two folders, the sources and the build, so each
-    entry of the package's path is tried. The environment variable ``MANYLIGHTS_PLUGIN_DIR``
-    replaces them where it is set.
+    editable installation leaves the package in the sources and puts the plugins where it would be
+    otherwise, so both are tried. The environment variable ``MANYLIGHTS_PLUGIN_DIR`` replaces them
+    where it is set.
 
     Raises:
         ImportError: Mitsuba is missing, no folder holds the compiled plugins, or only those of
@@ -32,8 +34,9 @@ def plugin_dir() -> str:
     """
     release = _import_mitsuba().__version__
     override = os.environ.get(OVERRIDE)
-    package = sys.modules["manylights"].__path__
-    entries = [Path(entry).resolve() for entry in ([override] if override else package)]
+    package = [*sys.modules["manylights"].__path__, f"{sysconfig.get_path('platlib')}/manylights"]
+    # Each once, in their order
+    entries = dict.fromkeys(Path(name).resolve() for name in ([override] if override else package))
     folders = [entry / f"mitsuba-{release}" for entry in entries]
     for folder in folders:
         if not _missing(folder):
@@ -76,7 +79,7 @@ def _missing(folder: Path) -> list[str]:
     ]
 
 
-def _releases(folders: list[Path]) -> list[str]:
+def _releases(folders: Iterable[Path]) -> list[str]:
     """Return the releases of Mitsuba that have a folder in one of these, oldest first."""
     names = {path.name for folder in folders for path in folder.glob("mitsuba-*")}
     return sorted(
