@@ -18,7 +18,7 @@ IN_PARALLEL := -n auto --maxprocesses 8 --dist worksteal
 BUILD_DIR := build/make
 
 SOURCES  := CMakeLists.txt pyproject.toml \
-            $(shell find ext plugins python -type f -not -name '*.pyc')
+            $(shell find ext plugins python/manylights -type f -not -name '*.pyc')
 CPP_DIRS := $(wildcard ext plugins tests)
 
 # The package is installed again when a source file or the choice of variants changes: the
@@ -41,6 +41,16 @@ demo: $(DEMO_INSTALLED)  ## Render a city with more than 10,000 lights to demo.e
 
 .PHONY: build
 build: $(INSTALLED)  ## Compile the plugins and install the package into .venv
+
+# Its objects are not those of other builds, which need not have all variants.
+.PHONY: wheel
+wheel: $(VENV)/.wheel-tools  ## Build a wheel with all variants into dist/, and try it out
+	@echo "Compiling the plugins for all variants. The first time takes some minutes."
+	@rm -rf build/wheel/built && mkdir -p dist
+	MANYLIGHTS_WHEEL=1 $(PIP) wheel --quiet --no-build-isolation --no-deps \
+	  -C build-dir=build/wheel/objects --wheel-dir build/wheel/built .
+	PATH="$(abspath $(BIN)):$$PATH" ext/repair-wheel build/wheel/built/*.whl dist
+	$(BIN)/python tests/try_wheel.py "$$(ls -t dist/*.whl | head -n 1)" $(ARGS)
 
 .PHONY: test
 test: $(INSTALLED)  ## Run the quick tests
@@ -88,6 +98,10 @@ bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
 microbench: $(INSTALLED) $(VENV)/.dev-tools  ## Time building, traversal and resampling alone (a minute) into microbench.json
 	$(BIN)/python -m pytest tests/bench_tree.py --benchmark-json=microbench.json $(ARGS)
 
+.PHONY: docs
+docs: $(DEMO_INSTALLED) $(VENV)/.docs-tools  ## Build the documentation into build/docs/html
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/doctrees python/docs build/docs/html
+
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling
 	$(BIN)/ruff check python tests
@@ -123,6 +137,14 @@ build/.system-packages: ext/missing-packages
 
 $(VENV)/.build-tools: pyproject.toml | build/.system-packages $(VENV)/.created
 	$(PIP) install --quiet --group build
+	@touch $@
+
+$(VENV)/.docs-tools: pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --group docs
+	@touch $@
+
+$(VENV)/.wheel-tools: $(VENV)/.build-tools
+	$(PIP) install --quiet --group wheel
 	@touch $@
 
 # Without build isolation the paths of the headers stay the same, and with them the objects.

@@ -5,6 +5,7 @@
 #                     wheel's libraries must be compiled with
 #   Mitsuba::mitsuba  the same, and the libraries
 # and the variables
+#   MitsubaWheel_VERSION       Mitsuba's release
 #   MitsubaWheel_VARIANTS      the variants that the wheel was built with
 #   MitsubaWheel_REQUIREMENTS  the pinned versions, as arguments for pip
 #   MitsubaWheel_nanobind_DIR  the folder of nanobind's CMake package
@@ -49,6 +50,7 @@ print(importlib.util.find_spec('${package}').submodule_search_locations[0])"
       "  ${Python_EXECUTABLE} -m pip install ${MitsubaWheel_REQUIREMENTS}")
   endif()
 endforeach()
+set(MitsubaWheel_VERSION "${found_mitsuba}")
 message(STATUS "Mitsuba ${found_mitsuba}: ${dir_mitsuba}")
 
 set(MitsubaWheel_nanobind_DIR "${dir_nanobind}/cmake")
@@ -71,9 +73,20 @@ target_include_directories(Mitsuba::abi INTERFACE
   "${dir_nanobind}/ext/robin_map/include"
   "${CMAKE_CURRENT_LIST_DIR}")
 # These choose members of Mitsuba's classes and must be those of the wheel.
-target_compile_definitions(Mitsuba::abi INTERFACE
-  MI_ENABLE_CUDA=1 MI_ENABLE_LLVM=1 MI_ENABLE_EMBREE=1 MI_ENABLE_AUTODIFF=1)
+target_compile_definitions(Mitsuba::abi INTERFACE MI_ENABLE_EMBREE=1 MI_ENABLE_AUTODIFF=1)
+foreach(backend IN ITEMS LLVM CUDA METAL)
+  string(TOLOWER "${backend}" prefix)
+  if(MitsubaWheel_VARIANTS MATCHES "${prefix}_")
+    target_compile_definitions(Mitsuba::abi INTERFACE MI_ENABLE_${backend}=1)
+  endif()
+endforeach()
 target_compile_options(Mitsuba::abi INTERFACE -fno-strict-aliasing)
+# Mitsuba's macros put names of files into messages: not where this machine has them.
+foreach(package IN ITEMS mitsuba drjit nanobind)
+  target_compile_options(Mitsuba::abi INTERFACE
+    "-ffile-prefix-map=${dir_${package}}=${package}")
+endforeach()
+target_compile_options(Mitsuba::abi INTERFACE "-ffile-prefix-map=${PROJECT_SOURCE_DIR}/=")
 # Nobody asks for errno or floating point exceptions, and both forbid short code: 1 % less
 # instructions of scalar variants, the same numbers.
 target_compile_options(Mitsuba::abi INTERFACE -fno-math-errno -fno-trapping-math)
@@ -85,7 +98,7 @@ endif()
 
 add_library(Mitsuba::libmitsuba SHARED IMPORTED)
 set_target_properties(Mitsuba::libmitsuba PROPERTIES
-  IMPORTED_LOCATION "${dir_mitsuba}/libmitsuba.so"
+  IMPORTED_LOCATION "${dir_mitsuba}/libmitsuba${CMAKE_SHARED_LIBRARY_SUFFIX}"
   # Libraries that libmitsuba itself needs: linkers want to see them, we do not call them.
   IMPORTED_LINK_DEPENDENT_LIBRARIES "drjit-core;drjit-extra;nanothread")
 

@@ -390,10 +390,10 @@ def test_paths_warn_of_lights_without_sense(scalar, warnings):
 # ----------------------------------------------------------------------- other Mitsubas, no libLLVM
 
 
-def python(script, **environment):
+def python(script, *arguments, **environment):
     """Run a script in a new process at the top of the sources."""
     return subprocess.run(
-        [sys.executable, "-c", script],
+        [sys.executable, "-c", script, *arguments],
         cwd=SOURCE,
         env={**os.environ, **environment},
         capture_output=True,
@@ -419,6 +419,49 @@ def test_another_mitsuba_is_refused_with_the_command(version):
         f"ImportError: manylights is compiled for Mitsuba 3.9.1, but Mitsuba {version} is "
         "installed. Get the matching one with: pip install mitsuba==3.9.1"
     )
+
+
+RELEASES = """
+import manylights, mitsuba
+for mitsuba.__version__ in ("3.9.1", "3.10.0"):
+    print(manylights.plugin_dir())
+mitsuba.__version__ = "3.11.0"
+manylights.plugin_dir()
+"""
+
+
+def test_plugins_of_the_installed_mitsuba_are_chosen(tmp_path):
+    """Of several releases in one package; one that is not there is refused, naming those."""
+    for release in ("3.10.0", "3.9.1"):
+        folder = tmp_path / f"mitsuba-{release}" / "plugins"
+        folder.mkdir(parents=True)
+        for name in PLUGINS:
+            (folder / f"{name}.so").write_bytes(b"")
+    process = python(RELEASES, MANYLIGHTS_PLUGIN_DIR=str(tmp_path))
+    assert process.stdout.split() == [str(tmp_path / f"mitsuba-{r}") for r in ("3.9.1", "3.10.0")]
+    assert last_line(process) == (
+        "ImportError: manylights is compiled for Mitsuba 3.9.1 and 3.10.0, but Mitsuba 3.11.0 is "
+        "installed. Get the matching one with: pip install mitsuba==3.10.0"
+    )
+
+
+EDITABLE = """
+import os, sys, sysconfig, manylights
+os.environ.pop("MANYLIGHTS_PLUGIN_DIR", None)
+manylights.__path__ = [sys.argv[1]]
+sysconfig.get_path = lambda name: sys.argv[2]
+print(manylights.plugin_dir())
+"""
+
+
+def test_plugins_of_an_editable_installation_are_found(tmp_path):
+    """Sources in one folder, plugins where packages are installed."""
+    folder = tmp_path / "manylights" / f"mitsuba-{mi.__version__}"
+    (folder / "plugins").mkdir(parents=True)
+    for name in PLUGINS:
+        (folder / "plugins" / f"{name}.so").write_bytes(b"")
+    process = python(EDITABLE, str(tmp_path / "sources"), str(tmp_path))
+    assert process.stdout.strip() == str(folder), process.stderr
 
 
 def test_missing_mitsuba_is_refused_with_the_command():
@@ -506,11 +549,15 @@ def command(*arguments):
 # ----------------------------------------------------------------------------- broken installations
 
 
+#: Folder of the plugins for the Mitsuba that is installed
+RELEASE = f"mitsuba-{mi.__version__}"
+
+
 @pytest.mark.parametrize("present", [[], *([name] for name in PLUGINS)], ids=str)
 def test_incomplete_folder_of_plugins_is_named(tmp_path, present):
     """The folder, the variable that chose it, what is missing and what to type."""
-    folder = tmp_path / "plugins"
-    folder.mkdir()
+    folder = tmp_path / RELEASE / "plugins"
+    folder.mkdir(parents=True)
     for name in present:
         (folder / f"{name}.so").write_bytes(b"")
     missing = ", ".join(name for name in PLUGINS if name not in present)
@@ -523,8 +570,8 @@ def test_incomplete_folder_of_plugins_is_named(tmp_path, present):
 
 def test_file_that_is_no_plugin_is_named(tmp_path):
     """Mitsuba's message has the file and the reason."""
-    folder = tmp_path / "plugins"
-    folder.mkdir()
+    folder = tmp_path / RELEASE / "plugins"
+    folder.mkdir(parents=True)
     for name in PLUGINS:
         (folder / f"{name}.so").write_text("text")
     process = python(LOAD, MANYLIGHTS_PLUGIN_DIR=str(tmp_path))

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from tests import statistics_tools as tools
+from tests import try_wheel
 
 SOURCE = Path(__file__).parents[1]
 PLUGINS = sorted(path.stem for path in (SOURCE / "plugins").glob("manylights_*.cpp"))
@@ -175,6 +177,37 @@ def write_toolchain(folder, processor):
     return f"-DCMAKE_TOOLCHAIN_FILE={path}"
 
 
+# ------------------------------------------------------------------------------------------ wheel
+
+LIBRARIES = ["libmanylights", *PLUGINS]
+
+
+@pytest.mark.parametrize(
+    ("tag", "names", "content", "said"),
+    [
+        ("py3-none", LIBRARIES, b"\0$ORIGIN\0/s\0 /a/b\0", None),
+        ("py3-none", LIBRARIES, b"\0/home/me/site-packages\0", "names ['/home/me/site-packages']"),
+        ("cp311-cp311", LIBRARIES, b"", "names a version of Python"),
+        ("py3-none", LIBRARIES[1:], b"", "its libraries are"),
+        ("py3-none", [*LIBRARIES, "../../_core"], b"", "_core.so is in it"),
+        ("py3-none", LIBRARIES, os.urandom(try_wheel.MOST_BYTES), "more than 10 MB"),
+    ],
+    ids=["good", "place", "tag", "missing", "core", "size"],
+)
+def test_faults_of_a_wheel_are_found(tmp_path, tag, names, content, said):
+    wheel = tmp_path / f"manylights-0.1.0-{tag}-linux_x86_64.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name in names:
+            folder = "manylights/mitsuba-3.9.1/plugins"
+            archive.writestr(os.path.normpath(f"{folder}/{name}.so"), content)
+            content = content[:100]
+    if said is None:
+        try_wheel.look_into(wheel)
+        return
+    with pytest.raises(SystemExit, match=re.escape(said)):
+        try_wheel.look_into(wheel)
+
+
 # ------------------------------------------------------------------------------------ full builds
 
 RENDER = '''
@@ -241,11 +274,11 @@ def test_all_variants_compile(cmake, all_variants):
 def test_compiled_variant_renders(all_variants, variant):
     """Each variant that the machine can run renders what Mitsuba does, in a process of its own."""
     package = all_variants / "manylights"
-    if not any((package / "plugins").glob("manylights_direct.*")):
+    if not any(package.glob("mitsuba-*/plugins/manylights_direct.*")):
         pytest.skip("the build of all variants has failed or was not selected")
     answer = run_python(RENDER, variant, MANYLIGHTS_PLUGIN_DIR=str(package))
     if answer is None:
         pytest.skip(f"this machine cannot run {variant}")
-    assert Path(answer["folder"]) == package.resolve()
+    assert Path(answer["folder"]) == package.resolve() / f"mitsuba-{mi.__version__}"
     ours, expected = (np.array(answer[key]).reshape(-1, 1, 1, 1) for key in ("ours", "reference"))
     tools.assert_same_mean(ours, expected, bias=0.1, label=variant)

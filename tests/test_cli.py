@@ -2,7 +2,10 @@
 
 import json
 import os
+import re
 import resource
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import __version__, cli, loading, plugin_dir
+from manylights.cli.main import parser
 from manylights.errors import UsageError
 from manylights.loading import integrators
 from manylights.output import exr
@@ -580,6 +584,43 @@ def test_version():
     assert mi.__version__ in told["Mitsuba"] and told["plugins"].strip() == plugin_dir()
     variants = told["variants"].strip().split(", ")
     assert "scalar_rgb" in variants and set(variants) <= set(mi.variants())
+
+
+COMPLETE = """
+source completion
+COMP_WORDS=(manylights $@) COMP_CWORD=$#
+_shtab_manylights
+echo "${COMPREPLY[@]}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [("re", "render report"), ("render --until", "--until-noise"), ("render sc", "scene.xml")],
+)
+def test_bash_completes_commands_options_and_files(tmp_path, typed, offered):
+    if shutil.which("bash") is None:
+        pytest.skip("there is no bash")
+    (tmp_path / "completion").write_text(manylights("--print-completion", "bash").stdout)
+    (tmp_path / "scene.xml").touch()
+    done = subprocess.run(
+        ["bash", "-c", COMPLETE, "bash", *typed.split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stderr, done.stdout.strip()) == ("", offered)
+
+
+@pytest.mark.parametrize("command", [(), ("render",)])
+def test_help_begins_with_examples_that_are_understood(command):
+    text = manylights(*command, "--help").stdout
+    examples = text.partition("\nexamples:\n")[2].partition("\n\n")[0].splitlines()
+    assert len(examples) == 3
+    for line in examples:
+        # What it does is said after some spaces.
+        parser().parse_args(shlex.split(re.split(r"\s{3,}", line.strip())[0])[1:])
 
 
 def test_no_command():

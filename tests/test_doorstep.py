@@ -1,5 +1,6 @@
 """What a visitor meets first: README, its commands and links, and what lies at the top level."""
 
+import json
 import re
 import shlex
 import subprocess
@@ -113,6 +114,54 @@ def test_numbers_of_the_readme_are_those_measured():
         cells = [lights, *numbers]
         assert any(set(cells) <= set(row) for row in measured), cells
         assert cycles == "-" or re.search(rf"\b{re.escape(cycles)}\b", by_hand), cycles
+
+
+def test_every_scene_has_a_small_picture_in_the_documentation():
+    scenes = [path.stem for path in (ROOT / "scenes").glob("*.xml")]
+    scenes += [f"usd_{path.stem}" for path in (ROOT / "scenes" / "usd").glob("*.usda")]
+    pictures = {path.stem: path for path in (ROOT / "python/docs/gallery").glob("*.jpg")}
+    assert pictures.keys() == set(scenes)
+    for path in pictures.values():
+        assert path.stat().st_size < 40_000, path
+
+
+def test_every_plugin_has_a_page_in_the_documentation():
+    stubs = [path.read_text() for path in (ROOT / "python/docs/plugins").glob("*.rst")]
+    named = {path for text in stubs for path in re.findall(r"source: (\S+)", text)}
+    plugins = (ROOT / "plugins").glob("manylights_*.cpp")
+    assert named == {str(path.relative_to(ROOT)) for path in plugins}
+
+
+NOTEBOOK = ROOT / "scenes" / "tutorial.ipynb"
+
+
+def cells():
+    """The cells of code of the notebook."""
+    notebook = json.loads(NOTEBOOK.read_text())
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def test_notebook_shows_pictures_and_is_small():
+    assert NOTEBOOK.stat().st_size < 1_000_000
+    shown = [output for cell in cells() for output in cell["outputs"]]
+    assert len([one for one in shown if "text/html" in one.get("data", {})]) == 5
+    # A log would name folders of the machine that ran it.
+    assert all(one["output_type"] == "execute_result" or one["name"] == "stdout" for one in shown)
+
+
+@pytest.mark.slow
+def test_notebook_runs(plugin, monkeypatch):
+    pytest.importorskip("pxr", reason="needs usd-core: pip install 'manylights[usd]'")
+    monkeypatch.chdir(NOTEBOOK.parent)
+    names = {}
+    for cell in cells():
+        exec(compile("".join(cell["source"]), NOTEBOOK.name, "exec"), names)
+    noisy, image = np.array(names["noisy"]), np.array(names["image"])
+    assert np.isfinite(image).all() and image.mean() > 0.0
+    # The same light, less noise: neighbours differ less
+    assert np.abs(np.diff(image, axis=1)).mean() < 0.5 * np.abs(np.diff(noisy, axis=1)).mean()
+    assert names["result"].noise <= 0.06
+    assert np.array(names["street"].bitmap)[..., :3].mean() > 0.0
 
 
 def test_top_level_holds_only_rooms():

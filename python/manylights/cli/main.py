@@ -6,12 +6,23 @@ import argparse
 import os
 import sys
 
+import shtab
+
 from manylights.cli import bench, compare, convert, demo, info, merge, render, report, tree, version
 from manylights.errors import one_line
 from manylights.progress import INTERRUPTED
 
 #: Exit status of a command that could not do what was asked.
 FAILURE = 2
+
+HELP = """\
+examples:
+  manylights demo                                     a city with 20,000 lights
+  manylights render scene.xml -o image.exr --spp 64   your scene, of Mitsuba or USD
+  manylights tree scene.xml                           which lights it has
+
+Renders scenes with very many lights. `manylights COMMAND --help` has more.
+"""
 
 #: In the order of the help; each has ``add(commands, common)``.
 COMMANDS = (render, merge, info, tree, convert, demo, bench, compare, report)
@@ -54,11 +65,16 @@ def parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
     made = argparse.ArgumentParser(
-        prog="manylights", description="Renders scenes with very many lights."
+        prog="manylights",
+        description=HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument("--version", action="store_true", help="print the version")
     made.add_argument(
         "--verbose", action="store_true", help="with --version: versions, variants, LLVM, CPU, GPU"
+    )
+    shtab.add_argument_to(
+        made, "--print-completion", help="print what lets a shell complete commands and options"
     )
     made.set_defaults(command=None)
     commands = made.add_subparsers(metavar="COMMAND")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+import shtab
+
 from manylights import loading
 from manylights.loading import integrators
 from manylights.loading.parsing import MOST_SUBDIVISION
@@ -16,7 +18,8 @@ VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scala
 
 def add_scene(parser) -> None:
     """Add SCENE and the options that say how it is read; ``defines`` and others give them back."""
-    parser.add_argument("scene", metavar="SCENE", help="XML file or USD stage")
+    scene = parser.add_argument("scene", metavar="SCENE", help="XML file or USD stage")
+    scene.complete = shtab.FILE
     add_define(parser)
     add_usd(parser)
 
@@ -61,9 +64,10 @@ def add_usd(parser) -> None:
 
 def add_machine(parser) -> None:
     """Add what a render is done with: seed, variant, threads."""
-    parser.add_argument("--seed", type=seed, default=0, help="0 to 4294967295 (default: 0)")
-    parser.add_argument("--variant", help=VARIANT_HELP)
-    parser.add_argument("--threads", type=positive, help="CPU threads of the render (default: all)")
+    group = parser.add_argument_group("random numbers and machine")
+    group.add_argument("--seed", type=seed, default=0, help="0 to 4294967295 (default: 0)")
+    group.add_argument("--variant", help=VARIANT_HELP)
+    group.add_argument("--threads", type=positive, help="CPU threads of the render (default: all)")
 
 
 def defines(options) -> dict[str, str]:

@@ -18,6 +18,11 @@ from manylights.rendering.parts import Part
 from manylights.rendering.render import part_path
 
 HELP = """\
+examples:
+  manylights render scene.xml -o image.exr --spp 64
+  manylights render scene.usdc -o image.exr --until-noise 0.02 --checkpoint 300
+  manylights render scene.xml -o image.exr --for 10m --set shadow_rays=8
+
 Renders a scene to an OpenEXR file and writes a PNG preview beside it. SCENE is an XML
 file of Mitsuba, or a USD stage (.usd, .usda, .usdc, .usdz).
 
@@ -60,36 +65,35 @@ def add(commands, common) -> None:
     )
     shared.add_scene(parser)
     parser.add_argument("-o", "--output", required=True, metavar="OUT.exr", help="image to write")
-    parser.add_argument(
-        "--spp", type=shared.positive, help="samples per pixel (default: the scene's)"
-    )
-    _add_targets(parser)
     parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
-    parser.add_argument(
+    _add_targets(parser)
+    method = parser.add_argument_group("integrator and sampler")
+    method.add_argument(
         "--integrator",
         metavar="NAME",
         help="keep: the scene's own; any other name: that plugin (default: manylights_direct "
         "instead of direct, manylights_volpath instead of path, volpath or none, any other stays)",
     )
-    parser.add_argument(
+    method.add_argument(
         "--sampler",
         metavar="NAME",
         help="keep: the scene's own; any other name: that plugin (default: manylights_sobol "
         "instead of independent or none, any other stays)",
     )
-    parser.add_argument(
+    method.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
         help="set a parameter of the integrator, any number of times (see below)",
     )
-    parser.add_argument(
+    method.add_argument(
         "--hide-lights",
         action="store_true",
         help="do not show lamps themselves, only what they light: --set hide_emitters=true",
     )
-    parser.add_argument(
+    interruptions = parser.add_argument_group("interruptions")
+    interruptions.add_argument(
         "--checkpoint",
         type=shared.seconds,
         metavar="SECONDS",
@@ -101,13 +105,14 @@ def add(commands, common) -> None:
 
 
 def _add_parts(parser) -> None:
-    parser.add_argument(
+    group = parser.add_argument_group("several machines")
+    group.add_argument(
         "--part",
         type=shared.part,
         metavar="K/N",
         help="render share K of N of the steps, for manylights merge",
     )
-    parser.add_argument(
+    group.add_argument(
         "--learnt",
         metavar="FILE",
         help="with --part: take what is learnt from this part or checkpoint of the same render",
@@ -115,13 +120,17 @@ def _add_parts(parser) -> None:
 
 
 def _add_targets(parser) -> None:
-    parser.add_argument(
+    group = parser.add_argument_group("samples, noise or time")
+    group.add_argument(
+        "--spp", type=shared.positive, help="samples per pixel (default: the scene's)"
+    )
+    group.add_argument(
         "--until-noise",
         type=shared.share,
         metavar="X",
         help="render until the noise is X (0.02 is 2 %%) or --spp is reached",
     )
-    parser.add_argument(
+    group.add_argument(
         "--for",
         dest="seconds",
         type=shared.duration,

@@ -35,7 +35,7 @@ class LoadedScene:
         choices: what was chosen and is not in the files, by the name of the option.
     """
 
-    scene: object
+    scene: Any
     integrator_count: int
     notes: list[str]
     files: list[Path] = field(default_factory=list)

@@ -13,6 +13,7 @@ sampling finds no light there: scenes with merged emitters are for ``manylights_
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -65,7 +66,7 @@ class Lamp:
 
     key: str
     id: str
-    mesh: object
+    mesh: Any
     radiance: np.ndarray
     materials: dict[str, object]
     uses: set[int]

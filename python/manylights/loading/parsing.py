@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 
@@ -49,8 +50,8 @@ class ParsedScene:
         exposure: factor of the camera, which images are multiplied by.
     """
 
-    config: object
-    state: object
+    config: Any
+    state: Any
     files: list[Path]
     notes: list[str] = field(default_factory=list)
     exposure: float = 1.0

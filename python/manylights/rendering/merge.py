@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -50,7 +51,7 @@ class Merged:
         files: that were written.
     """
 
-    bitmap: object
+    bitmap: Any
     samples: int
     missing: str
     notes: list[str]

@@ -65,7 +65,7 @@ class RenderResult:
     """
 
     image: np.ndarray
-    bitmap: object
+    bitmap: Any
     variance: np.ndarray | None
     noise: float | None
     samples: int

@@ -1,4 +1,4 @@
-"""Procedural scenes with 1 to 1,000,000 lights, as dictionaries for ``mi.load_dict``.
+"""Procedural scenes with 1 to 1,000,000 lights, as dictionaries for ``mi.load_dict``::
 
     import mitsuba as mi
     import manylights

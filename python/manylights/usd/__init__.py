@@ -1,6 +1,8 @@
-"""USD stages as dictionaries for ``mi.load_dict``; needs ``pip install 'manylights[usd]'``.
+"""USD stages as dictionaries for ``mi.load_dict``::
 
-scene = mi.load_dict(manylights.usd.load("scene.usdc"))
+    scene = mi.load_dict(manylights.usd.load("scene.usdc"))
+
+Needs ``pip install 'manylights[usd]'``.
 """
 
 from __future__ import annotations

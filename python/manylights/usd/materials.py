@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -46,7 +47,7 @@ class Material:
     emission: dict | None = None
     uv_primvar: str | None = None
     lookups: list[Lookup] = field(default_factory=list)
-    prim: object = None
+    prim: Any = None
 
     def bsdf_object(self):
         """Return Mitsuba's BSDF, the same one for all meshes."""

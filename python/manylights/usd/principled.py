@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -31,20 +32,20 @@ class Look:
         normal: a normal map, or ``None``.
     """
 
-    base_color: object = (0.18, 0.18, 0.18)
+    base_color: Any = (0.18, 0.18, 0.18)
     base_weight: float = 1.0
-    metallic: object = 0.0
-    roughness: object = 0.5
+    metallic: Any = 0.0
+    roughness: Any = 0.5
     ior: float = 1.5
-    specular_color: object = None
-    clearcoat: object = 0.0
-    clearcoat_roughness: object = 0.01
-    opacity: object = 1.0
+    specular_color: Any = None
+    clearcoat: Any = 0.0
+    clearcoat_roughness: Any = 0.01
+    opacity: Any = 1.0
     threshold: float = 0.0
     presence: bool = False
-    emission: object = (0.0, 0.0, 0.0)
+    emission: Any = (0.0, 0.0, 0.0)
     emission_weight: float = 1.0
-    normal: object = None
+    normal: Any = None
 
     def parts(self) -> list:
         """Return all that may be an image or a primvar."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pxr import Sdf, UsdShade
@@ -32,8 +33,8 @@ class Lookup:
         threshold: above 0, values become 1 where they reach it, else 0.
     """
 
-    file: object
-    node: object
+    file: Any
+    node: Any
     channel: str = "rgb"
     scale: np.ndarray = field(default_factory=lambda: np.ones(4))
     bias: np.ndarray = field(default_factory=lambda: np.zeros(4))
@@ -61,7 +62,7 @@ class Attribute:
     """
 
     primvar: str
-    fallback: object
+    fallback: Any
 
 
 def shader_id(shader) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class Surface:
     colors_per: str = "face"
     opacity_per: str = "face"
     double_sided: bool = False
-    binding: object = None
+    binding: Any = None
     uv_sets: dict[str, np.ndarray] = field(default_factory=dict)
 
     def part(self, chosen: np.ndarray) -> Surface:
