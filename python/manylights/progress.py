@@ -18,6 +18,9 @@ REFRESH = 0.1
 #: Seconds after which work whose length nobody knows gets a bar.
 PATIENCE = 1.0
 
+#: Lines below a bar, at most.
+MOST_LINES = 16
+
 #: Exit status of a command that Ctrl-C ended, as shells have it: 128 + SIGINT.
 INTERRUPTED = 130
 
@@ -114,10 +117,14 @@ class Bar:
 
     Attributes:
         text: shown beside the bar.
+        lines: shown below it.
+        interrupted: was there a Ctrl-C that the work is to end at?
     """
 
     def __init__(self) -> None:
         self.estimate, self.text = Estimate(), ""
+        self.lines: list[str] = []
+        self.interrupted = threading.Event()
 
     def begin(self, fraction: float) -> None:
         """Begin with a fraction, from 0 to 1, that was finished before, by an earlier process."""
@@ -132,6 +139,7 @@ def run_with_bar(
     title: str,
     work: Callable[[Bar], Any],
     farewell: Callable[[], str] = lambda: NOTHING_WRITTEN,
+    patient: bool = False,
 ) -> Any:
     """Run ``work(bar)`` with a progress bar on stderr and return its result.
 
@@ -144,6 +152,7 @@ def run_with_bar(
         title: what the bar is labelled with.
         work: is given the bar, to tell how far it is.
         farewell: returns what to print after Ctrl-C.
+        patient: let the work end itself at the first Ctrl-C, once it sees ``bar.interrupted``.
     """
     bar = Bar()
     outcome: dict[str, Any] = {}
@@ -157,21 +166,41 @@ def run_with_bar(
     worker = threading.Thread(target=run, name="manylights-render", daemon=True)
     worker.start()
     try:
-        _show(title, bar, worker)
+        _show_patiently(title, bar, worker) if patient else _show(title, bar, worker)
     except KeyboardInterrupt:
         # Never released: nothing is written any more.
         files.writing.acquire()
         say(farewell())
         os._exit(INTERRUPTED)
+    if bar.interrupted.is_set() and "error" in outcome:
+        say(farewell())
+        sys.exit(INTERRUPTED)
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]
+
+
+def _show_patiently(title: str, bar: Bar, worker: threading.Thread) -> None:
+    try:
+        _show(title, bar, worker)
+    except KeyboardInterrupt:
+        bar.interrupted.set()
+        _show("ending", bar, worker)
 
 
 def _show(title: str, state: Bar, worker: threading.Thread) -> None:
     # Commands without a bar start without it.
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    from rich.text import Text
+
+    class BarWithLines(Progress):
+        def get_renderables(self):
+            yield from super().get_renderables()
+            lines = state.lines
+            yield from (Text(f"  {line}") for line in lines[:MOST_LINES])
+            if len(lines) > MOST_LINES:
+                yield Text(f"  and {len(lines) - MOST_LINES} others")
 
     console = Console(stderr=True)
     columns = (
@@ -180,7 +209,7 @@ def _show(title: str, state: Bar, worker: threading.Thread) -> None:
         TaskProgressColumn(),
         TextColumn("{task.fields[left]} left {task.fields[text]}"),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with BarWithLines(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0, left=format_seconds(None), text="")
         while worker.is_alive():
             worker.join(REFRESH)
