@@ -4,7 +4,9 @@ import json
 import os
 import random
 import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import manylights
@@ -16,9 +18,10 @@ from manylights.errors import UsageError
 from manylights.rendering import state_file
 
 from tests import worker_faults
-from tests.conftest import require_variant
+from tests.conftest import heed_ctrl_c, require_variant
 from tests.test_parts import content, write_scene
 
+dask = pytest.importorskip("dask", reason="needs Dask: pip install distributed")
 distributed = pytest.importorskip("distributed", reason="needs Dask: pip install distributed")
 
 from manylights.rendering.workers import connection, task  # noqa: E402
@@ -57,6 +60,7 @@ def start_cluster(count=2, **options):
 @pytest.fixture(scope="module")
 def shared_client(faults):
     """A client with two workers."""
+    dask.config.set({"distributed.deploy.lost-worker-timeout": "1 hour"})
     with start_cluster() as cluster, distributed.Client(cluster, set_as_default=False) as made:
         yield made
 
@@ -65,7 +69,7 @@ def shared_client(faults):
 def client(shared_client, faults):
     """The client, with workers that have no faults yet."""
     faults.unlink(missing_ok=True)
-    shared_client.wait_for_workers(2, timeout=60)
+    shared_client.wait_for_workers(2, timeout=120)
     yield shared_client
     faults.unlink(missing_ok=True)
 
@@ -177,6 +181,7 @@ def test_a_killed_worker_leaves_its_steps_to_others(client, scene, variant, faul
     assert "is gone, others render its step" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_step_that_ends_three_workers_is_named_and_the_rest_kept(
     client, scene, faults, tmp_path, capsys, scalar
 ):
@@ -213,6 +218,7 @@ def test_what_a_worker_raises_is_told_with_its_name(
     assert pixels(resumed) == pixels(whole) and not (tmp_path / "c.exr").exists()
 
 
+@pytest.mark.slow
 def test_a_scene_that_ends_whoever_loads_it_is_told(client, scene, faults, scalar):
     set_faults(faults, load="killed")
     with pytest.raises(RuntimeError, match="loading the scene ended 3 workers: "):
@@ -286,22 +292,17 @@ def test_other_versions_take_no_part(client, scene, capsys, scalar):
         client.run(other_version, version=manylights.__version__)
 
 
-@pytest.mark.parametrize("what", ["scene.xml", "data"])
-def test_other_files_are_named_with_the_host(client, scene, faults, tmp_path, what, scalar):
+@pytest.mark.parametrize("name", ["scene.xml", "data/bulbs.ply"])
+def test_other_files_are_named_with_the_host(client, faults, tmp_path, name, scalar):
     elsewhere = tmp_path / "elsewhere"
     mine = tmp_path / "mine"
     mine.mkdir()
-    scene = write_scene(mine / "scene.xml", "gallery" if what == "data" else "many_bulbs")
+    scene = write_scene(mine / "scene.xml")
     worker_faults.copy_scene(mine, elsewhere)
-    changed = [path for path in elsewhere.rglob("*") if path.is_file()]
-    used = {Path(one).name for one in manylights.loading.load(str(scene)).files}
-    name = next(p for p in sorted(changed) if (what in str(p)) and p.name in used)
-    name.write_bytes(name.read_bytes() + b"\n")
+    changed = elsewhere / name
+    changed.write_bytes(changed.read_bytes() + b"\n")
     set_faults(faults, folder=[str(mine), str(elsewhere)])
-    relative = name.relative_to(elsewhere)
-    with pytest.raises(
-        UsageError, match=rf"worker \d on \S+: it has another content of {relative}"
-    ):
+    with pytest.raises(UsageError, match=rf"worker \d on \S+: it has another content of {name}"):
         manylights.render(scene, spp=37, client=client)
     set_faults(faults, folder=[str(mine), str(tmp_path / "nowhere")])
     with pytest.raises(UsageError, match=r"worker \d on .*nowhere/scene.xml: no such file"):
@@ -324,11 +325,11 @@ def test_files_are_sent_to_workers_without_them(client, scene, faults, tmp_path,
 
 
 def test_absolute_names_cannot_be_sent(client, scene, tmp_path, scalar):
-    other = tmp_path / "other.xml"
-    other.write_text('<scene version="3.0.0"></scene>')
+    mesh = tmp_path / "data" / "bulbs.ply"
     text = scene.read_text()
-    scene.write_text(text.replace("</scene>", f'<include filename="{other}"/></scene>'))
-    with pytest.raises(UsageError, match=rf"--ship: .*scene.xml names {other}, which is elsewhere"):
+    assert '"data/bulbs.ply"' in text
+    scene.write_text(text.replace("data/bulbs.ply", str(mesh)))
+    with pytest.raises(UsageError, match=rf"--ship: .*scene.xml names {mesh}, which is elsewhere"):
         manylights.render(scene, spp=37, client=client, ship=True)
 
 
@@ -442,3 +443,163 @@ def test_local_workers_listen_to_this_machine_alone(faults):
         assert listening and set(listening) == {"127.0.0.1"}
         workers = made.scheduler_info()["workers"].values()
         assert [worker["nthreads"] for worker in workers] == [1]
+
+
+@pytest.fixture
+def certificate(tmp_path):
+    """Dask's configuration of a certificate that everybody here has."""
+    key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"
+    kind = ["ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"]
+    command = ["openssl", "req", "-x509", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
+    command += ["-newkey", *kind, "-keyout", str(key), "-out", str(cert)]
+    try:
+        subprocess.run(command, check=True, capture_output=True)
+    except FileNotFoundError:
+        pytest.skip("openssl makes the certificate (on Debian: apt install openssl)")
+    files = {"ca-file": str(cert)}
+    for role in ("scheduler", "worker", "client"):
+        files |= {f"{role}.key": str(key), f"{role}.cert": str(cert)}
+    return {f"distributed.comm.tls.{name}": value for name, value in files.items()}
+
+
+def test_tls_takes_the_configuration_of_dask(
+    certificate, faults, scene, tmp_path, monkeypatch, capsys, scalar
+):
+    faults.unlink(missing_ok=True)
+    whole = manylights.render(scene, spp=37, seed=5)
+    options = ["--spp", "37", "--seed", "5", "--variant", scalar]
+    command = ["render", str(scene), "-o", str(tmp_path / "a.exr"), *options]
+    with dask.config.set({**certificate, "distributed.comm.require-encryption": True}):
+        security = distributed.Security()
+        with start_cluster(1, protocol="tls://", security=security) as cluster:
+            address = cluster.scheduler_address
+            assert address.startswith("tls://")
+            assert cli.main([*command, "--workers", address]) == 0
+            with dask.config.set(dict.fromkeys(certificate)):
+                assert cli.main([*command, "--workers", address]) == 2
+            monkeypatch.setattr(connection, "PATIENCE", 2.0)
+            plain = address.replace("tls", "tcp")
+            with dask.config.set({"distributed.comm.require-encryption": False}):
+                assert cli.main([*command, "--workers", plain]) == 2
+    log = capsys.readouterr().err
+    assert f"--workers {address}: " in log and f"--workers {plain}: " in log
+    assert np.array(mi.Bitmap(str(tmp_path / "a.exr"))).tobytes() == pixels(whole)
+
+
+# ------------------------------------------------------------------------- processes of their own
+
+#: A program whose renders have short steps, as the processes have that it starts.
+CHILD = """
+import sys
+from tests import worker_faults
+worker_faults.dask_setup(None)
+if __name__ == "__main__":
+    from manylights import cli
+    sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def start(scene, tmp_path, faults):
+    """A function that starts a render with a seed, and workers if arguments say so."""
+    set_faults(faults, step="all", fault="slow")
+    program, started = tmp_path / "program.py", []
+    program.write_text(CHILD)
+
+    def run(*arguments):
+        options = ["-o", tmp_path / "a.exr", "--spp", 37, "--seed", 5, "--variant", "scalar_rgb"]
+        command = [sys.executable, program, "render", scene, *options, *arguments]
+        process = subprocess.Popen(
+            list(map(str, command)),
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=heed_ctrl_c,
+        )
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        process.kill()
+
+
+def wait_for(path, process, seconds=240):
+    """Wait until a file is there, while a process runs."""
+    begin = time.monotonic()
+    while not path.exists():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() - begin < seconds
+        time.sleep(0.1)
+
+
+def finish(process):
+    """Wait for the end of a process; return its exit status and log."""
+    log = process.communicate(timeout=300)[1]
+    return process.returncode, log
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_has_arrived(start, scene, tmp_path, faults, scalar):
+    kept = tmp_path / "a.checkpoint.exr"
+    process = start("--workers", "local:2", "--checkpoint", 1e-6)
+    wait_for(kept, process)
+    os.kill(process.pid, signal.SIGINT)
+    status, log = finish(process)
+    assert status == 130 and f"{kept} has " in log and "the same command goes on" in log
+    assert "Traceback" not in log
+    assert state_file.read(kept, "", "")[0].state.history.spp > 0
+    faults.unlink()
+    status, log = finish(start("--checkpoint", 60))
+    assert status == 0 and "the render goes on from there" in log, log
+    whole = manylights.render(scene, spp=37, seed=5)
+    assert np.array(mi.Bitmap(str(tmp_path / "a.exr"))).tobytes() == pixels(whole)
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_and_a_lost_client_cost_nothing(start, scene, tmp_path, faults, scalar):
+    kept, found = tmp_path / "a.checkpoint.exr", tmp_path / "scheduler.json"
+    preload = str(ROOT / "tests" / "worker_faults.py")
+
+    def serve():
+        found.unlink(missing_ok=True)
+        program = [sys.executable, "-m", "dask"]
+        common = ["--scheduler-file", str(found), "--no-dashboard"]
+        scheduler = subprocess.Popen(
+            [*program, "scheduler", "--host", "127.0.0.1", "--port", "0", *common],
+            stderr=subprocess.DEVNULL,
+        )
+        wait_for(found, scheduler)
+        worker = subprocess.Popen(
+            [*program, "worker", "--nthreads", "1", "--preload", preload, *common],
+            stderr=subprocess.DEVNULL,
+        )
+        return scheduler, worker
+
+    started = []
+    try:
+        started += (pair := serve())
+        process = start("--workers", found, "--checkpoint", 1e-6)
+        wait_for(kept, process)
+        pair[0].kill()
+        status, log = finish(process)
+        assert status == 2 and "workers: the scheduler tcp://127.0.0.1:" in log, log
+        assert " is gone" in log and "the same command goes on from there" in log
+        before = state_file.read(kept, "", "")[0].state.history.spp
+        assert before > 0
+        started += (pair := serve())
+        process = start("--workers", found, "--checkpoint", 1e-6)
+        while state_file.read(kept, "", "")[0].state.history.spp == before:
+            assert process.poll() is None, process.communicate()[1]
+            time.sleep(0.2)
+        process.kill()
+        process.wait()
+        faults.unlink()
+        status, log = finish(start("--workers", found, "--checkpoint", 1e-6))
+        assert status == 0 and "the render goes on from there" in log, log
+    finally:
+        for process in started:
+            process.kill()
+    whole = manylights.render(scene, spp=37, seed=5)
+    assert np.array(mi.Bitmap(str(tmp_path / "a.exr"))).tobytes() == pixels(whole)

@@ -53,12 +53,12 @@ def dask_setup(worker):
             fail(found["fault"])
         return render(driver, step, *others)
 
-    def load_or_fail(path, **others):
+    def load_or_fail(path, *others, **named):
         found = known_faults()
         fail(found.get("load"))
         if found.get("folder") and worker.name == found.get("worker", worker.name):
             path = path.replace(*found["folder"])
-        return load(path, **others)
+        return load(path, *others, **named)
 
     Driver.render, loading.load = render_or_fail, load_or_fail
 

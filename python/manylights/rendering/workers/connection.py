@@ -73,7 +73,8 @@ class Connection:
         from distributed import Client
 
         # What becomes of workers is told by the render.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        for name in ("distributed", "asyncio", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         enter = self._stack.enter_context
         if count is None:
             where = {"address": self.address}
@@ -90,8 +91,16 @@ def _local_cluster(count: int, threads: int | None, folder: str):
 
     Without a limit of Dask's own on memory: a render by itself has none.
     """
+    import dask
     from distributed import LocalCluster
 
+    # Whoever was killed is started again, however long that takes; and no pages about it all.
+    dask.config.set(
+        {
+            "distributed.deploy.lost-worker-timeout": "1 hour",
+            "distributed.scheduler.http.routes": ["distributed.http.health"],
+        }
+    )
     return LocalCluster(
         n_workers=count,
         threads_per_worker=threads or max(dr.thread_count() // count, 1),
@@ -100,6 +109,8 @@ def _local_cluster(count: int, threads: int | None, folder: str):
         protocol="tcp://",
         dashboard_address=None,
         worker_dashboard_address=None,
+        # Dask has a port for them all the same, on the same interface.
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
         memory_limit=0,
         local_directory=folder,
         silence_logs=logging.CRITICAL,

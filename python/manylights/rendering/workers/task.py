@@ -96,8 +96,8 @@ def render(key: str, steps: list[Step], wants_learnt: bool) -> dict[str, Any] | 
 
     Returns:
         ``films``: of each sequence its number and arrays to add up; ``checksum`` of them;
-        ``learnt``; ``seconds``; ``processor``. None if this process does not know the job (any
-        more).
+        ``learnt``; ``seconds``; ``processor``. Or ``problem`` alone, in words. None if this process
+        does not know the job (any more).
     """
     with busy:
         engagement = engagements.get(key)
@@ -105,8 +105,12 @@ def render(key: str, steps: list[Step], wants_learnt: bool) -> dict[str, Any] | 
             return None
         mi.set_variant(engagement.variant)
         begin = perf_counter()
-        with thread_count(engagement.threads):
-            sums = _render(key, engagement, steps)
+        try:
+            with thread_count(engagement.threads):
+                sums = _render(key, engagement, steps)
+        except Exception as error:
+            kind = "out of memory, " if isinstance(error, MemoryError) else ""
+            return {"problem": kind + one_line(error)}
         if sums is None:
             return None
         films = [(number, _arrays(one)) for number, one in sorted(sums.items())]

@@ -26,6 +26,9 @@ from manylights.rendering.workers.shipping import Cargo
 #: Seconds between two looks at who is there.
 LOOK_SECONDS = 0.5
 
+#: Seconds without any worker after which that is said.
+LONELY_SECONDS = 20.0
+
 #: Seconds that a wait for results takes at most: the progress is told in between.
 WAIT_SECONDS = 0.2
 
@@ -114,6 +117,7 @@ class Team:
         self.members: dict[str, Member] = {}
         self.ended: queue.SimpleQueue = queue.SimpleQueue()
         self.looked, self.killed = -LOOK_SECONDS, []
+        self.lonely_since: float | None = None
 
     def __enter__(self) -> Team:
         self.client.subscribe_topic(task.topic(self.key), self._heard)
@@ -177,6 +181,7 @@ class Team:
         for address in there:
             if address not in self.members:
                 self._greet(Member(address, address.partition("://")[2]))
+        self._say_if_lonely()
         refused = [member for member in self.members.values() if member.problem is not None]
         if refused and len(refused) == len(self.members):
             texts = [f"worker {member.label}: {member.problem}" for member in refused]
@@ -212,6 +217,8 @@ class Team:
         if result is None:
             # A new process under the same address.
             self._greet(member)
+        elif "problem" in result:
+            raise RuntimeError(f"worker {member.label}, {share.words()}: {result['problem']}")
         elif task.checksum(result["films"]) != result["checksum"]:
             say(f"worker {member.label}: a film was damaged on its way, it is rendered again")
             result = None
@@ -229,10 +236,7 @@ class Team:
         if share is None:
             self._arrived(member, {"label": member.label, "problem": one_line(error)})
             return None
-        kind = "out of memory, " if isinstance(error, MemoryError) else ""
-        raise RuntimeError(
-            f"worker {member.label}, {share.words()}: {kind}{one_line(error)}"
-        ) from error
+        raise RuntimeError(f"worker {member.label}, {share.words()}: {one_line(error)}") from error
 
     def _arrived(self, member: Member, answer: dict[str, Any]) -> None:
         member.label, member.problem = answer["label"], answer["problem"]
@@ -264,6 +268,16 @@ class Team:
                 names = ", ".join(self.killed)
                 raise RuntimeError(f"loading the scene ended {MOST_LOSSES} workers: {names}")
         return []
+
+    def _say_if_lonely(self) -> None:
+        now = time.monotonic()
+        if self.members:
+            self.lonely_since = None
+        elif self.lonely_since is None:
+            self.lonely_since = now
+        elif now - self.lonely_since > LONELY_SECONDS:
+            say("workers: there are none, the render waits for some")
+            self.lonely_since = float("inf")
 
     def _send(self, member: Member, function: Callable, *arguments) -> None:
         """Have a worker, and no other, call a function of this package."""
