@@ -547,7 +547,7 @@ def test_ctrl_c_keeps_what_has_arrived(start, scene, tmp_path, faults, scalar):
     wait_for(kept, process)
     os.kill(process.pid, signal.SIGINT)
     status, log = finish(process)
-    assert status == 130 and f"{kept} has " in log and "the same command goes on" in log
+    assert status == 130 and f"{kept} has " in log and "the same command goes on" in log, log
     assert "Traceback" not in log
     assert state_file.read(kept, "", "")[0].state.history.spp > 0
     faults.unlink()

@@ -156,17 +156,22 @@ def run_with_bar(
     """
     bar = Bar()
     outcome: dict[str, Any] = {}
+    # Not the thread's own end: Python takes it for ended when Ctrl-C interrupts its join().
+    done = threading.Event()
 
     def run() -> None:
         try:
             outcome["result"] = work(bar)
         except BaseException as error:
             outcome["error"] = error
+        done.set()
 
-    worker = threading.Thread(target=run, name="manylights-render", daemon=True)
-    worker.start()
+    threading.Thread(target=run, name="manylights-render", daemon=True).start()
     try:
-        _show_patiently(title, bar, worker) if patient else _show(title, bar, worker)
+        if patient:
+            _show_patiently(title, bar, done)
+        else:
+            _show(title, bar, done)
     except KeyboardInterrupt:
         # Never released: nothing is written any more.
         files.writing.acquire()
@@ -180,15 +185,15 @@ def run_with_bar(
     return outcome["result"]
 
 
-def _show_patiently(title: str, bar: Bar, worker: threading.Thread) -> None:
+def _show_patiently(title: str, bar: Bar, done: threading.Event) -> None:
     try:
-        _show(title, bar, worker)
+        _show(title, bar, done)
     except KeyboardInterrupt:
         bar.interrupted.set()
-        _show("ending", bar, worker)
+        _show("ending", bar, done)
 
 
-def _show(title: str, state: Bar, worker: threading.Thread) -> None:
+def _show(title: str, state: Bar, done: threading.Event) -> None:
     # Commands without a bar start without it.
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
@@ -211,8 +216,7 @@ def _show(title: str, state: Bar, worker: threading.Thread) -> None:
     )
     with BarWithLines(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0, left=format_seconds(None), text="")
-        while worker.is_alive():
-            worker.join(REFRESH)
+        while not done.wait(REFRESH):
             left = format_seconds(state.estimate.seconds_left())
             bar.update(task, completed=state.estimate.fraction(), left=left, text=state.text)
         bar.update(task, completed=1.0, left=format_seconds(0.0))
