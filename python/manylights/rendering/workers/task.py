@@ -50,6 +50,9 @@ class Engagement:
 #: The jobs of this process by their keys. Several clients may share a worker.
 engagements: dict[str, Engagement] = {}
 
+#: Keys of jobs whose clients have gone.
+left: set[str] = set()
+
 #: Mitsuba and its scenes have one state for the process: one task at a time.
 busy = threading.Lock()
 
@@ -67,7 +70,7 @@ def arrive(order: dict[str, Any], files: list[np.ndarray]) -> dict[str, Any]:
     own = _worker()
     label = _label(own)
     with busy:
-        leave(order["key"])
+        _forget(order["key"])
         folder, problem = None, None
         try:
             if order["names"]:
@@ -79,6 +82,8 @@ def arrive(order: dict[str, Any], files: list[np.ndarray]) -> dict[str, Any]:
             problem = f"it has {'; '.join(changes)}" if changes else None
         except Exception as error:
             problem = one_line(error)
+        if order["key"] in left:
+            problem = "its client has gone"
         if problem is None:
             engagements[order["key"]] = Engagement(job, order["variant"], threads, folder)
         elif folder is not None:
@@ -122,6 +127,11 @@ def render(key: str, steps: list[Step], wants_learnt: bool) -> dict[str, Any] | 
 
 def leave(key: str) -> None:
     """Forget a job, after the step that is being rendered, and delete its files."""
+    left.add(key)
+    _forget(key)
+
+
+def _forget(key: str) -> None:
     engagement = engagements.pop(key, None)
     if engagement is not None and engagement.folder is not None:
         shutil.rmtree(engagement.folder, ignore_errors=True)

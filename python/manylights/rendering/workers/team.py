@@ -231,6 +231,8 @@ class Team:
         from distributed.scheduler import KilledWorker
 
         if error is None or isinstance(error, KilledWorker):
+            if share is None:
+                self._count_killed(member)
             self._greet(member)
             return None if share is None else Outcome(member, share, None, is_lost=True)
         if share is None:
@@ -263,11 +265,14 @@ class Team:
             say(f"worker {member.label} is gone, others render its {share.words()}")
             return [Outcome(member, share, None, is_lost=True)]
         if not member.ready and member.problem is None:
-            self.killed.append(member.label)
-            if len(self.killed) >= MOST_LOSSES:
-                names = ", ".join(self.killed)
-                raise RuntimeError(f"loading the scene ended {MOST_LOSSES} workers: {names}")
+            self._count_killed(member)
         return []
+
+    def _count_killed(self, member: Member) -> None:
+        self.killed.append(member.label)
+        if len(self.killed) >= MOST_LOSSES:
+            names = ", ".join(self.killed)
+            raise RuntimeError(f"loading the scene ended {MOST_LOSSES} workers: {names}")
 
     def _say_if_lonely(self) -> None:
         now = time.monotonic()
@@ -289,15 +294,18 @@ class Team:
             allow_other_workers=False,
             pure=False,
         )
-        gathering = self.client.gather(future, asynchronous=True)
-        waiting = asyncio.run_coroutine_threadsafe(gathering, self.client.loop.asyncio_loop)
+        waiting = asyncio.run_coroutine_threadsafe(_result(future), self.client.loop.asyncio_loop)
         member.future, member.waiting = future, waiting
         waiting.add_done_callback(lambda done: self.ended.put((member, future, done)))
 
     def _drop(self, member: Member) -> None:
-        waiting, future = member.waiting, member.future
+        """Have nobody wait for what a worker does.
+
+        Dask's future alone is cancelled, which ends the wait for it: a wait that is cancelled
+        itself while Dask fetches results leaves the client unable to fetch any others.
+        """
+        future = member.future
         member.share, member.future, member.waiting = None, None, None
-        waiting.cancel()
         with suppress(Exception):
             future.cancel()
 
@@ -314,6 +322,11 @@ class Team:
 
     def _lost_scheduler(self) -> RuntimeError:
         return RuntimeError(f"workers: the scheduler {self.client.scheduler.address} is gone")
+
+
+async def _result(future) -> Any:
+    """Wait for a future of Dask, and fetch its result, in the client's event loop."""
+    return await future
 
 
 def order_of(job: Job, facts: dict, threads: int | None) -> dict[str, Any]:
