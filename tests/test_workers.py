@@ -159,6 +159,14 @@ def test_parts_and_other_samplers_can_be_shared_out(client, scene, tmp_path, sam
     assert content(tmp_path / "merged.exr") == content(tmp_path / "whole.exr")
 
 
+def test_renders_of_fewer_steps_than_workers_say_so(client, scene, monkeypatch, capsys, scalar):
+    whole = manylights.render(scene, spp=2)
+    shared = manylights.render(scene, spp=2, client=client)
+    assert pixels(shared) == pixels(whole)
+    log = capsys.readouterr().err
+    assert "workers: this render has 1 step, at most 1 share the work" in log
+
+
 # ------------------------------------------------------------------------------ workers that fail
 
 

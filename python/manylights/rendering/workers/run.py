@@ -85,7 +85,7 @@ class Foreman:
         self.job, self.state, self.store = job, state, store
         self.team, self.report = team, report
         self.start, self.before = time.perf_counter(), state.history.seconds
-        self.shares = Shares([])
+        self.shares, self.has_said = Shares([]), False
 
     def run(self) -> None:
         """Render all rounds: one without a noise as the target."""
@@ -115,6 +115,7 @@ class Foreman:
         while len(self.shares) or team.rendering:
             for outcome in team.look():
                 self._settle(outcome)
+            self._say_if_few(len(steps))
             self._give_out()
             outcome = team.wait()
             # Who has given back something goes on while it is added.
@@ -122,6 +123,14 @@ class Foreman:
             if outcome is not None:
                 self._settle(outcome)
             self._tell()
+
+    def _say_if_few(self, count: int) -> None:
+        """Say once that there are more workers than steps; with a noise later rounds have more."""
+        if self.has_said or self.job.course.has_target or len(self.team.members) <= count:
+            return
+        self.has_said = True
+        steps = "1 step" if count == 1 else f"{count} steps"
+        say(f"workers: this render has {steps}, at most {count} share the work")
 
     def _give_out(self) -> None:
         for member in self.team.idle():
