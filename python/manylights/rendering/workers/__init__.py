@@ -19,17 +19,17 @@ worker learns visibility itself from the same training passes, a second of work,
 for another and nothing more travels.
 
 A thousand workers, on paper: each sends one film in half a minute, 33 in a second. At 1920 x 1080
-these are 33 MB each, or 66 to 100 MB as exact sums, 1 to 3 GB/s in all: beyond one client. What the
-scheduler does is little: 33 tasks and some hundred events in a second, and 40 kB of addresses each
-second to the client. But films pass through its process unless the client takes them from the
-workers (``Client(..., direct_to_workers=True)``). Two ways lead on, both without loss of a bit,
-since sums of sums are exact, too:
+one is 33 MB, or 66 to 100 MB as an exact sum: 1 to 3 GB/s in all, and adding one takes the client
+some tenths of a second. So one client keeps up with fifty workers or so. The scheduler has little
+to do: 33 tasks and some hundred events in a second, and each half second its addresses to the
+client, 40 kB. But films pass through its process, unless the client fetches them from the workers
+(``Client(..., direct_to_workers=True)``). Two ways lead on, neither costs a bit, since sums of sums
+are exact, too:
 
-- longer runs: the time between two films of a worker may grow with the number of workers, to ten
-  minutes for a thousand, at the price of more that a lost worker loses;
-- merging in a tree: ``--part k/32`` gives each of 32 clients its own steps, workers and file, all
-  with the same scheduler or with their own; ``manylights merge`` adds the 32 files, in groups and
-  in any order. A client that adds 33 MB films in 30 ms keeps up with about 30 workers.
+- merging in a tree: ``--part k/32`` gives each of 32 clients steps, workers and a file of its own,
+  with one scheduler for each; ``manylights merge`` adds the 32 files, in groups and in any order;
+- longer runs (``shares.RUN_SECONDS``): ten minutes for a thousand workers are as many films for the
+  client as half a minute for fifty, at the price of more that a lost worker loses.
 """
 
 from manylights.rendering.workers.connection import Connection
