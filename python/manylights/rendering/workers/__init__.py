@@ -21,7 +21,7 @@ for another and nothing more travels.
 A thousand workers, on paper: each sends one film in half a minute, 33 in a second. At 1920 x 1080
 one is 33 MB, or 66 to 100 MB as an exact sum: 1 to 3 GB/s in all, and adding one takes the client
 some tenths of a second. So one client keeps up with fifty workers or so. The scheduler has little
-to do: 33 tasks and some hundred events in a second, and each half second its addresses to the
+to do: 33 tasks and some hundred events in a second, and each second its addresses to the
 client, 40 kB. But films pass through its process, unless the client fetches them from the workers
 (``Client(..., direct_to_workers=True)``). Two ways lead on, neither costs a bit, since sums of sums
 are exact, too:

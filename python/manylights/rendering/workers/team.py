@@ -24,7 +24,7 @@ from manylights.rendering.workers.shares import MOST_LOSSES, Share
 from manylights.rendering.workers.shipping import Cargo
 
 #: Seconds between two looks at who is there.
-LOOK_SECONDS = 0.5
+LOOK_SECONDS = 1.0
 
 #: Seconds without any worker after which that is said.
 LONELY_SECONDS = 20.0
@@ -42,7 +42,6 @@ class Member:
         label: its name for people.
         share: what it renders, None for nothing.
         future: Dask's, of what it does.
-        waiting: for the result of it.
         ready: has it the scene?
         problem: why it cannot take part, if so.
         pace: seconds that a step took it.
@@ -54,7 +53,6 @@ class Member:
     label: str
     share: Share | None = None
     future: Any = None
-    waiting: Any = None
     ready: bool = False
     problem: str | None = None
     pace: float | None = None
@@ -86,8 +84,8 @@ class Outcome:
     Attributes:
         member: who had it.
         share: what it was.
-        result: of ``task.render``; None if it has to be rendered by another one.
-        is_lost: is the worker gone?
+        result: of ``task.render``; None if the share has to be rendered again.
+        is_lost: is the worker's process gone?
     """
 
     member: Member
@@ -200,7 +198,7 @@ class Team:
             return None
         if member.future is not future:
             return None
-        share, member.share, member.future, member.waiting = member.share, None, None, None
+        share, member.share, member.future = member.share, None, None
         try:
             result = waiting.result()
         except (CancelledError, asyncio.CancelledError):
@@ -214,7 +212,8 @@ class Team:
         return self._rendered(member, share, result)
 
     def _rendered(self, member: Member, share: Share, result) -> Outcome:
-        if result is None:
+        is_lost = result is None
+        if is_lost:
             # A new process under the same address.
             self._greet(member)
         elif "problem" in result:
@@ -224,7 +223,7 @@ class Team:
             result = None
         else:
             member.pace = result["seconds"] / len(share.steps)
-        return Outcome(member, share, result)
+        return Outcome(member, share, result, is_lost)
 
     def _failed(self, member: Member, share: Share | None, error) -> Outcome | None:
         """Tell what a task that raised something means."""
@@ -295,7 +294,7 @@ class Team:
             pure=False,
         )
         waiting = asyncio.run_coroutine_threadsafe(_result(future), self.client.loop.asyncio_loop)
-        member.future, member.waiting = future, waiting
+        member.future = future
         waiting.add_done_callback(lambda done: self.ended.put((member, future, done)))
 
     def _drop(self, member: Member) -> None:
@@ -305,7 +304,7 @@ class Team:
         itself while Dask fetches results leaves the client unable to fetch any others.
         """
         future = member.future
-        member.share, member.future, member.waiting = None, None, None
+        member.share, member.future = None, None
         with suppress(Exception):
             future.cancel()
 
