@@ -49,6 +49,7 @@ def start_cluster(count=2, **options):
         host="127.0.0.1",
         dashboard_address=None,
         memory_limit=0,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
         silence_logs=50,
         preload=[str(ROOT / "tests" / "worker_faults.py")],
         **options,

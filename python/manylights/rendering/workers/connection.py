@@ -24,6 +24,19 @@ WHAT = "local:N, tcp://HOST:PORT, tls://HOST:PORT or a scheduler file (.json)"
 #: Seconds to wait for a scheduler.
 PATIENCE = 15.0
 
+#: Dask's configuration of workers on this machine, which share its processors with the render.
+LOCAL = {
+    # Whoever was killed is started again, however long that takes.
+    "distributed.deploy.lost-worker-timeout": "1 hour",
+    # No pages about it all.
+    "distributed.scheduler.http.routes": ["distributed.http.health"],
+    # Dask looks many times a second what its own code does, and who could do whose work.
+    "distributed.worker.profile.enabled": False,
+    "distributed.scheduler.work-stealing": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "10s",
+}
+
 
 class Connection:
     """Workers that the command line asked for. They start while the scene is loaded.
@@ -94,13 +107,7 @@ def _local_cluster(count: int, threads: int | None, folder: str):
     import dask
     from distributed import LocalCluster
 
-    # Whoever was killed is started again, however long that takes; and no pages about it all.
-    dask.config.set(
-        {
-            "distributed.deploy.lost-worker-timeout": "1 hour",
-            "distributed.scheduler.http.routes": ["distributed.http.health"],
-        }
-    )
+    dask.config.set(LOCAL)
     return LocalCluster(
         n_workers=count,
         threads_per_worker=threads or max(dr.thread_count() // count, 1),
