@@ -2,11 +2,13 @@
 
 import doctest
 import math
+import random
 
 import pytest
 from manylights.rendering import plan, targets
 from manylights.rendering.plan import ALL, OTHERS, TRAIN, Limits, Step
 from manylights.rendering.targets import Course, History, PowerLaw
+from manylights.rendering.workers.shares import Shares
 
 SIZES = [1, 640 * 360, 1920 * 1080, 3840 * 2160]
 
@@ -193,3 +195,105 @@ def test_sequences_take_turns():
         done.add(step, 0.0)
         assert max(done.samples) - min(done.samples) <= step.spp
     assert len(set(done.samples)) == 1
+
+
+# -------------------------------------------------------------------------- steps out of their turn
+
+
+def courses():
+    """Renders with and without a noise as the target, of all kinds of samplers."""
+    limits = [Limits(640 * 360, indexed=indexed) for indexed in (True, False)]
+    return [
+        *(Course(spp, one) for spp in (1, 300, 3000) for one in limits),
+        *(Course(5000, one, noise=0.01) for one in limits),
+        *(Course(3000, one, part=targets.Part(2, 3)) for one in limits),
+    ]
+
+
+@pytest.mark.parametrize("course", courses(), ids=str)
+def test_open_steps_are_those_in_turn(course):
+    """Whoever takes all that can be rendered now, in any order, renders the same steps."""
+
+    def noise_of(samples):
+        return samples**-0.7
+
+    expected, steps = follow(course, noise_of)
+    done, found, chance = History([0] * course.sequences), [], random.Random(4)
+    while current := list(course.open_steps(done)):
+        # Some are left for the next question, as of a render that was interrupted.
+        for number, step in chance.sample(current, max(len(current) * 2 // 3, 1)):
+            done.add(step, 0.0, number)
+            found.append((number, step))
+        if course.round_is_complete(done):
+            done.noises.append(noise_of(min(done.samples)))
+        first = course.next_step(done)
+        assert first is None or done.steps == steps.index(first)
+    assert [step for _, step in sorted(found, key=lambda one: one[0])] == steps
+    assert [number for number, _ in sorted(found, key=lambda one: one[0])] == list(
+        range(len(steps))
+    )
+    assert (done.samples, done.noises, done.steps) == (
+        expected.samples,
+        expected.noises,
+        expected.steps,
+    )
+    assert done.ahead == [] and course.next_step(done) is None
+
+
+def test_times_have_no_open_steps():
+    assert not list(Course(100, Limits(500), seconds=9.0).open_steps(History([0] * 4)))
+
+
+@pytest.mark.parametrize("course", courses(), ids=str)
+def test_lesson_is_what_the_first_step_begins_with(course):
+    first = Course(course.spp, course.limits, course.noise).next_step(History([0] * 4))
+    lesson = course.lesson()
+    assert (lesson is None) == (not first.trains)
+    if lesson is not None:
+        assert lesson.passes == first.passes[: len(lesson.passes)]
+        assert all(one.role == TRAIN for one in lesson.passes)
+        assert not any(one.role == TRAIN for one in first.passes[len(lesson.passes) :])
+
+
+# ---------------------------------------------------------------------- what workers get at a time
+
+
+def shares_of(count):
+    """The steps of a render with nobody at work yet."""
+    return Shares((number, Step((), 1, 0, number)) for number in range(count))
+
+
+def test_runs_take_half_a_minute_and_shrink_to_the_end():
+    shares, sizes = shares_of(100), []
+    assert shares.take(None, 4).numbers == [0]
+    while len(shares):
+        sizes.append(len(shares.take(4.0, 4).steps))
+    assert sizes[0] == 7 and sizes == sorted(sizes, reverse=True) and sizes[-8:] == [1] * 8
+    assert sum(sizes) == 99
+    assert shares_of(10).take(1e-9, 1).numbers == [0, 1, 2, 3, 4]
+    assert shares_of(10).take(70.0, 1).numbers == [0]
+
+
+def test_what_comes_back_is_given_out_again():
+    shares = shares_of(40)
+    first, second = shares.take(5.0, 1), shares.take(5.0, 1)
+    assert (first.numbers, second.numbers) == ([0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 10, 11])
+    assert second.words() == "steps 7 to 12" and second.spp == 6
+    shares.give_back(second)
+    assert shares.take(5.0, 1).numbers == second.numbers
+    shares.give_back(first)
+    assert shares.take(1.0, 1).numbers == first.numbers, "consecutive steps only"
+
+
+def test_steps_that_end_workers_are_found():
+    """Alone, so that those beside it are not blamed."""
+    shares = shares_of(40)
+    assert not shares.lose(shares.take(5.0, 1))
+    for _ in range(2):
+        runs = [shares.take(5.0, 1) for _ in range(6)]
+        assert [run.numbers for run in runs] == [[number] for number in range(6)]
+        fatal = [shares.lose(run) for run in runs if run.numbers == [3]]
+        for run in runs:
+            if run.numbers != [3]:
+                shares.give_back(run)
+    assert fatal == [True] and runs[3].words() == "step 4"

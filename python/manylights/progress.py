@@ -18,6 +18,9 @@ REFRESH = 0.1
 #: Seconds after which work whose length nobody knows gets a bar.
 PATIENCE = 1.0
 
+#: Lines below a bar, at most.
+MOST_LINES = 16
+
 #: Exit status of a command that Ctrl-C ended, as shells have it: 128 + SIGINT.
 INTERRUPTED = 130
 
@@ -114,10 +117,14 @@ class Bar:
 
     Attributes:
         text: shown beside the bar.
+        lines: shown below it.
+        interrupted: was there a Ctrl-C that the work is to end at?
     """
 
     def __init__(self) -> None:
         self.estimate, self.text = Estimate(), ""
+        self.lines: list[str] = []
+        self.interrupted = threading.Event()
 
     def begin(self, fraction: float) -> None:
         """Begin with a fraction, from 0 to 1, that was finished before, by an earlier process."""
@@ -132,6 +139,7 @@ def run_with_bar(
     title: str,
     work: Callable[[Bar], Any],
     farewell: Callable[[], str] = lambda: NOTHING_WRITTEN,
+    patient: bool = False,
 ) -> Any:
     """Run ``work(bar)`` with a progress bar on stderr and return its result.
 
@@ -144,34 +152,60 @@ def run_with_bar(
         title: what the bar is labelled with.
         work: is given the bar, to tell how far it is.
         farewell: returns what to print after Ctrl-C.
+        patient: let the work end itself at the first Ctrl-C, once it sees ``bar.interrupted``.
     """
     bar = Bar()
     outcome: dict[str, Any] = {}
+    # Not the thread's own end: Python takes it for ended when Ctrl-C interrupts its join().
+    done = threading.Event()
 
     def run() -> None:
         try:
             outcome["result"] = work(bar)
         except BaseException as error:
             outcome["error"] = error
+        done.set()
 
-    worker = threading.Thread(target=run, name="manylights-render", daemon=True)
-    worker.start()
+    threading.Thread(target=run, name="manylights-render", daemon=True).start()
     try:
-        _show(title, bar, worker)
+        if patient:
+            _show_patiently(title, bar, done)
+        else:
+            _show(title, bar, done)
     except KeyboardInterrupt:
         # Never released: nothing is written any more.
         files.writing.acquire()
         say(farewell())
         os._exit(INTERRUPTED)
+    if bar.interrupted.is_set() and "error" in outcome:
+        say(farewell())
+        sys.exit(INTERRUPTED)
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]
 
 
-def _show(title: str, state: Bar, worker: threading.Thread) -> None:
+def _show_patiently(title: str, bar: Bar, done: threading.Event) -> None:
+    try:
+        _show(title, bar, done)
+    except KeyboardInterrupt:
+        bar.interrupted.set()
+        _show("ending", bar, done)
+
+
+def _show(title: str, state: Bar, done: threading.Event) -> None:
     # Commands without a bar start without it.
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    from rich.text import Text
+
+    class BarWithLines(Progress):
+        def get_renderables(self):
+            yield from super().get_renderables()
+            lines = state.lines
+            yield from (Text(f"  {line}") for line in lines[:MOST_LINES])
+            if len(lines) > MOST_LINES:
+                yield Text(f"  and {len(lines) - MOST_LINES} others")
 
     console = Console(stderr=True)
     columns = (
@@ -180,10 +214,9 @@ def _show(title: str, state: Bar, worker: threading.Thread) -> None:
         TaskProgressColumn(),
         TextColumn("{task.fields[left]} left {task.fields[text]}"),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with BarWithLines(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0, left=format_seconds(None), text="")
-        while worker.is_alive():
-            worker.join(REFRESH)
+        while not done.wait(REFRESH):
             left = format_seconds(state.estimate.seconds_left())
             bar.update(task, completed=state.estimate.fraction(), left=left, text=state.text)
         bar.update(task, completed=1.0, left=format_seconds(0.0))

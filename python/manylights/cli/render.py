@@ -17,6 +17,9 @@ from manylights.rendering.checkpoint import path_for
 from manylights.rendering.parts import Part
 from manylights.rendering.render import part_path
 
+#: Seconds between two writings of a checkpoint of workers, if nobody asks for one.
+CHECKPOINT_SECONDS = 60.0
+
 HELP = """\
 examples:
   manylights render scene.xml -o image.exr --spp 64
@@ -50,6 +53,13 @@ OUT.part-03-of-16.exr, a picture, too. manylights merge OUT.part-*.exr -o OUT.ex
 to the image, the same, bit for bit, as without parts. Each part first learns what the first
 step teaches, or takes it from a part that is there with --learnt FILE. With --checkpoint
 a part keeps its state in its own file.
+
+--workers local:4 renders with four processes on this machine, --workers tcp://HOST:8786 (or
+tls://HOST:8786, or scheduler.json) with all workers of a scheduler of Dask distributed, which
+pip install 'manylights[dask]' installs. Workers may come, go and crash: the image is that of
+one process, bit for bit. They need the same version and the same files at the same path;
+--ship sends the files. The state is kept as with --checkpoint 60; Ctrl-C keeps what has
+arrived. tcp:// to another machine is for networks where everybody is trusted.
 """
 
 
@@ -100,8 +110,23 @@ def add(commands, common) -> None:
         help="keep the state every so often; after an interruption the same command goes on",
     )
     _add_parts(parser)
+    _add_workers(parser)
     shared.add_machine(parser)
     parser.set_defaults(command=_run)
+
+
+def _add_workers(parser) -> None:
+    parser.add_argument(
+        "--workers",
+        metavar="ADDRESS",
+        help="render with workers of Dask: local:N, tcp://HOST:PORT, tls://HOST:PORT or "
+        "scheduler.json; --threads is for each of them",
+    )
+    parser.add_argument(
+        "--ship",
+        action="store_true",
+        help="with --workers: send them the scene's files (default: they have the same folder)",
+    )
 
 
 def _add_parts(parser) -> None:
@@ -156,6 +181,20 @@ def _run(options) -> None:
     if options.hide_lights:
         settings["hide_emitters"] = True
     shared.start(options)
+    if options.workers is None:
+        if options.ship:
+            raise UsageError("--ship: there are no --workers to send files to")
+        _load_and_render(options, target, defines, settings)
+        return
+    if options.checkpoint is None:
+        options.checkpoint = CHECKPOINT_SECONDS
+    from manylights.rendering import workers
+
+    with workers.Connection(options.workers, options.threads) as connection:
+        _load_and_render(options, target, defines, settings, connection)
+
+
+def _load_and_render(options, target: Path, defines, settings, connection=None) -> None:
     stage = shared.usd_options(options)
     with waiting("loading"):
         loaded = loading.load(
@@ -172,6 +211,8 @@ def _run(options) -> None:
     if options.checkpoint is not None:
         path = part_path(target, options.part) if options.part else path_for(target)
         wanted |= {"checkpoint": path, "checkpoint_seconds": options.checkpoint}
+    if connection is not None:
+        wanted |= {"client": connection.client(), "ship": options.ship}
     render_to(loaded, target, wanted)
 
 
@@ -209,6 +250,9 @@ def render_to(loaded: loading.LoadedScene, target: Path, wanted: dict) -> Render
             if progress.noise is not None:
                 bar.text = f"noise {progress.noise:.3g}, {progress.samples} spp"
             bar.report(progress.fraction)
+            bar.lines = progress.workers
+            if bar.interrupted.is_set():
+                raise KeyboardInterrupt
 
         return render(loaded, output=target, progress=report, **wanted)
 
@@ -216,7 +260,7 @@ def render_to(loaded: loading.LoadedScene, target: Path, wanted: dict) -> Render
         kept = seen[0].kept if seen else None
         return f"interrupted, {kept}; the same command goes on" if kept else NOTHING_WRITTEN
 
-    result = run_with_bar("rendering", work, farewell)
+    result = run_with_bar("rendering", work, farewell, patient="client" in wanted)
     for note in result.notes[len(loaded.notes) :]:
         say(note)
     names = " and ".join(str(path) for path in result.files)

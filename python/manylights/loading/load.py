@@ -33,6 +33,8 @@ class LoadedScene:
         files: what it was read from, the scene file first.
         exposure: factor of the camera, which images are multiplied by.
         choices: what was chosen and is not in the files, by the name of the option.
+        arguments: of ``load``, with which another process loads the same; empty if it was not read
+            from a file.
     """
 
     scene: Any
@@ -41,6 +43,7 @@ class LoadedScene:
     files: list[Path] = field(default_factory=list)
     exposure: float = 1.0
     choices: dict[str, Any] = field(default_factory=dict)
+    arguments: dict[str, Any] = field(default_factory=dict)
 
 
 def load(
@@ -68,6 +71,8 @@ def load(
     loaded.choices["define"] = defines or {}
     if usd_options is not None and usd_options != UsdOptions():
         loaded.choices["usd"] = asdict(usd_options)
+    loaded.arguments = {"path": path, "defines": defines, "integrator": integrator}
+    loaded.arguments |= {"settings": settings, "usd_options": usd_options, "sampler": sampler}
     return loaded
 
 

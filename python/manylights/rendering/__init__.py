@@ -8,6 +8,7 @@
 - ``job``: a render with all that its image depends on;
 - ``parts``: which steps each of several machines has;
 - ``state_file``, ``checkpoint``: the state in a file, and when it is written;
+- ``workers``: the same steps by several processes and machines;
 - ``render``: puts these together, and ``merge`` what several have rendered.
 """
 

@@ -14,9 +14,10 @@ from manylights.errors import UsageError, one_line
 from manylights.progress import say
 from manylights.rendering import state_file
 from manylights.rendering.job import Job, differences
-from manylights.rendering.parts import Run
+from manylights.rendering.parts import Part, Run
 from manylights.rendering.state import State
 from manylights.rendering.state_file import Saved
+from manylights.rendering.targets import History
 from manylights.threads import processor
 
 REMEDY = "delete it to start anew, or choose another output"
@@ -76,12 +77,12 @@ class Checkpoint:
         of = "" if course.has_target else f" of {course.predicted_spp([])}"
         return f"{self.path} has {self.samples}{of} samples per pixel"
 
-    def keep(self, state: State) -> None:
-        """Write the state if the last time was long enough ago.
+    def keep(self, state: State, at_once: bool = False) -> None:
+        """Write the state if the last time was long enough ago, or at once.
 
         A file that cannot be written costs a message and not the render: the one before it stays.
         """
-        if self.clock() - self.last < self.seconds:
+        if not at_once and self.clock() - self.last < self.seconds:
             return
         try:
             self.write(state)
@@ -101,9 +102,18 @@ class Checkpoint:
         part = self.job.course.part
         name = processor()
         state.processors += [] if name in state.processors else [name]
-        runs, shown = [Run(part, state.history.steps)], self.job.driver.shown()
+        runs, shown = self._runs(state.history), self.job.driver.shown()
         saved = Saved(self.path, self.facts, runs, state, shown, list(part.command))
         state_file.write(saved)
+
+    def _runs(self, history: History) -> list[Run]:
+        """Return which steps there are; of each beyond the first gap a part of its own has it."""
+        course = self.job.course
+        runs, count = [Run(course.part, history.steps)], course.step_count
+        if count is not None:
+            indices = [course.part.step(number) for number in history.ahead]
+            runs += [Run(Part(index + 1, count), 1) for index in indices]
+        return runs
 
     def _read(self) -> State:
         saved, _ = state_file.read(self.path, "checkpoint", f", {REMEDY}")
@@ -132,6 +142,6 @@ def learnt(path: Path, job: Job, facts: dict) -> np.ndarray:
     changes = "; ".join(differences(saved.facts, facts, but=("part",)))
     if changes:
         raise UsageError(f"{path}: of another render. It has {changes}")
-    if not saved.state.learnt.size and job.course.training(State.empty(1).history) is not None:
+    if not saved.state.learnt.size and job.course.training(History([0])) is not None:
         raise UsageError(f"{path}: nothing was learnt yet")
     return saved.state.learnt

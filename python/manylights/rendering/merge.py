@@ -103,6 +103,7 @@ class _Parts:
         self.steps = self.facts["step_count"]
         # The files' runs are kept, their sums are not.
         self.state, first.state = first.state, None
+        self.state.history.ahead = []
         self.times = np.zeros(self.steps, np.uint32)
         self._count_steps(first)
 

@@ -82,6 +82,11 @@ class Step:
     scramble: int
     index: int
 
+    @property
+    def trains(self) -> bool:
+        """Does it begin with training passes?"""
+        return any(one.role == TRAIN for one in self.passes)
+
     @staticmethod
     def of(passes: list[Pass], scramble: int = 0, index: int = 0) -> Step:
         """Return the step of these passes; training and what it leaves count once."""
@@ -165,18 +170,6 @@ def step_size(spp: int, limits: Limits) -> int:
 def is_single(spp: int, limits: Limits) -> bool:
     """Is it one step, whose passes the integrator makes?"""
     return spp * limits.pixels <= SINGLE_STEP_SAMPLES
-
-
-def training(spp: int, limits: Limits) -> Step | None:
-    """Return a step of the training passes alone, None if there are none.
-
-    Its film is not part of the image: it teaches those who do not render the first step.
-    """
-    if is_single(spp, limits):
-        return None
-    first = step_at(0, spp, limits)
-    passes = tuple(one for one in first.passes if one.role == TRAIN)
-    return Step(passes, first.spp, 0, 0) if passes else None
 
 
 def passes(first: int, count: int, limits: Limits) -> list[Pass]:

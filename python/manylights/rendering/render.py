@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ class Progress:
         seconds: that they took, those of interrupted processes, too.
         noise: relative, of the last round; None if it is not known.
         kept: what the checkpoint holds, in words; None without or before the first.
+        workers: lines about what each of them does.
     """
 
     fraction: float
@@ -44,6 +45,7 @@ class Progress:
     seconds: float
     noise: float | None = None
     kept: str | None = None
+    workers: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -90,6 +92,8 @@ def render(
     learnt: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
+    client=None,
+    ship: bool = False,
 ) -> RenderResult:
     """Render a scene: a number of samples, or until an image is good enough or a time is up.
 
@@ -97,10 +101,10 @@ def render(
     however often it was interrupted; so does ``until_noise``. The current variant is used.
 
     Args:
-        scene: path of an XML file or a USD stage; a dictionary as for ``mi.load_dict``, for example
-            of ``manylights.usd.load``; an ``mi.Scene``, which is rendered as it is; or what
-            ``manylights.loading.load`` returned. Of files and dictionaries ``direct``, ``path`` and
-            ``volpath`` are replaced by our integrators, ``independent`` by ``manylights_sobol``.
+        scene: path of an XML file or a USD stage; a dictionary as for ``mi.load_dict``; an
+            ``mi.Scene``, which is rendered as it is; or what ``manylights.loading.load`` returned.
+            Of files and dictionaries ``direct``, ``path`` and ``volpath`` are replaced by our
+            integrators, ``independent`` by ``manylights_sobol``.
         spp: samples per pixel, 1 or more; with a target the most there may be. Default: what the
             scene's sampler says, with a target 65536.
         seed: of the random numbers, 0 to 4294967295.
@@ -110,29 +114,26 @@ def render(
         until_noise: render until ``RenderResult.noise`` is this, above 0: 0.02 is 2 %.
         seconds: render for so long, above 0. The last step may end later, by its length or 5 %.
         output: file (.exr) to write the image to, with a PNG beside it. Default: none.
-        checkpoint: file (.exr) that keeps the state, to go on from there another time. Removed once
-            there is an image. Default: the state is not kept.
+        checkpoint: file (.exr) of the state, to go on from another time. Removed at the end.
         checkpoint_seconds: at least between two writings of it.
         part: ``(3, 16)`` renders the third of 16 shares of the steps, with ``output="a.exr"`` to
             ``a.part-03-of-16.exr``, for ``manylights.merge``. Default: all, without parts.
         learnt: file of another part, to take over what is learnt. Default: learn it anew.
-        progress: called before the first step and after each, in scalar variants also in between
-            and from other threads. What it raises ends the render.
-        threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
+        progress: called now and then, also from other threads. What it raises ends the render.
+        threads: CPU threads, 1 or more. Default: all, on workers those that Dask knows of.
+        client: ``distributed.Client``, whose workers render the scene of a file. Default: none.
+        ship: send them the files? Default: the workers have these at the same path.
 
     Raises:
-        UsageError: (a ``ValueError``) a number out of range, no such file or sensor, no parts of
-            such a render, a file of another render.
-        RuntimeError: Mitsuba cannot read or render the scene.
+        UsageError: (a ``ValueError``) impossible values, files of another render, no worker of use.
+        RuntimeError: Mitsuba or a worker cannot read or render the scene.
     """
-    check("threads", threads, threads is None or threads >= 1, "1 or more")
     target = None if output is None else images.check_output(str(output))
     loaded, own = loading.as_loaded(scene, integrator)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
-    with thread_count(threads):
-        run(job, state, store, progress or (lambda _: None))
+    _work(job, state, store, facts, progress or (lambda _: None), threads, client, ship)
     return _finished(job, state, store, facts, target)
 
 
@@ -145,6 +146,22 @@ def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any]
     if learnt is not None and not state.learnt.size:
         state.learnt = checkpoints.learnt(Path(learnt), job, facts)
     return facts, state
+
+
+def _work(job: Job, state: State, store, facts, progress, threads, client, ship) -> None:
+    """Render what the state does not have, here or with workers."""
+    check("threads", threads, threads is None or threads >= 1, "1 or more")
+    check("ship", ship, not ship or client is not None, "given with client")
+    if client is None:
+        with thread_count(threads):
+            run(job, state, store, progress)
+        return
+    from manylights.rendering import workers
+
+    def report(begun: float, spent: float, lines: list[str]) -> None:
+        progress(replace(_progress(job, state, store, begun, spent), workers=lines))
+
+    workers.run(job, state, store, facts or job.facts(), client, report, threads, ship)
 
 
 def part_path(target: str | Path, part: Part) -> Path:

@@ -150,6 +150,9 @@ def _state(found: dict[str, np.ndarray], facts: dict[str, Any]) -> State:
     ]
     sums = [Sums(np.stack(parts[at : at + PARTS])) for at in range(0, len(parts), PARTS)]
     history = History(**facts["history"])
+    ahead = [number for number in history.ahead if type(number) is int and number > history.steps]
+    if ahead != sorted(set(history.ahead)):
+        raise ValueError(f"the steps {history.ahead} beyond {history.steps}")
     if len(history.samples) != len(sums):
         raise ValueError(f"{len(history.samples)} numbers of samples and {len(sums)} sequences")
     learnt, processors = _unpacked(facts["learnt"]), list(facts["processors"])

@@ -10,6 +10,7 @@ and these are too dark.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from manylights.rendering import plan as plans
@@ -59,10 +60,39 @@ class Course:
         return min(plans.SEQUENCES, self.spp) if self.has_target else 1
 
     def next_step(self, done: History) -> Step | None:
-        """Return the step after those that are done, None at the end."""
+        """Return the first step that is not done, None at the end."""
+        if done.ahead:
+            return next((step for _, step in self.open_steps(done)), None)
         if self.has_target:
             return self._towards_target(done)
         return plans.step_at(self.part.step(done.steps), self.spp, self.limits)
+
+    def open_steps(self, done: History) -> Iterator[tuple[int, Step]]:
+        """Yield what can be rendered now, in any order: numbers and steps that are not done.
+
+        Steps are numbered from 0 in their order. With a noise as the target they are those of the
+        round; the next one depends on its noise. There are none with a time as the target: each
+        step depends on the one before.
+        """
+        if self.seconds is not None:
+            return
+        for number, step in self._round(done) if self.has_target else self._all(done.steps):
+            if number >= done.steps and number not in done.ahead:
+                yield number, step
+
+    def _all(self, begin: int) -> Iterator[tuple[int, Step]]:
+        for number in range(begin, self.part.steps(self.step_count)):
+            yield number, plans.step_at(self.part.step(number), self.spp, self.limits)
+
+    def _round(self, done: History) -> Iterator[tuple[int, Step]]:
+        """Yield all steps of the round that the noises so far lead to."""
+        goals = [0, *(self.goal(done.noises[:count])[0] for count in range(len(done.noises)))]
+        largest = self.limits.largest()
+        steps = sum(-(-(goal - before) // largest) for before, goal in zip(goals, goals[1:]))
+        trial = History([goals[-1]] * self.sequences, done.noises, steps * self.sequences)
+        while (step := self._towards_target(trial)) is not None:
+            yield trial.steps, step
+            trial.add(step, 0.0)
 
     @property
     def step_count(self) -> int | None:
@@ -73,7 +103,20 @@ class Course:
         """Return what a part has to learn from that others begin with, None if nothing."""
         if self.has_target or self.part.step(0) == 0 or self.next_step(done) is None:
             return None
-        return plans.training(self.spp, self.limits)
+        return self.lesson()
+
+    def lesson(self) -> Step | None:
+        """Return a step of the training passes alone, None if there are none.
+
+        Its film is not part of the image: it teaches those who do not render the first step.
+        """
+        if not self.has_target and plans.is_single(self.spp, self.limits):
+            return None
+        first = Course(self.spp, self.limits, self.noise, self.seconds).next_step(
+            History([0] * self.sequences)
+        )
+        passes = tuple(one for one in first.passes if one.role == plans.TRAIN)
+        return Step(passes, first.spp, 0, 0) if passes else None
 
     def goal(self, noises: list[float]) -> tuple[int, bool]:
         """Return the samples of each sequence at the end of the round after these noises.
@@ -168,10 +211,11 @@ class History:
     Attributes:
         samples: per pixel, of each sequence.
         noises: after each round.
-        steps: how many.
+        steps: how many are done without a gap.
         last_spp: samples per pixel of the last step.
         seconds: that all of it took.
         last_seconds: that the last step took.
+        ahead: numbers of steps that are done beyond the first gap, in their order.
     """
 
     samples: list[int]
@@ -180,11 +224,15 @@ class History:
     last_spp: int = 0
     seconds: float = 0.0
     last_seconds: float = 0.0
+    ahead: list[int] = field(default_factory=list)
 
-    def add(self, step: Step, seconds: float) -> None:
-        """Add a step that took so long."""
+    def add(self, step: Step, seconds: float, number: int | None = None) -> None:
+        """Add a step that took so long; its number, if it is not the first that is missing."""
         self.samples[step.scramble] += step.spp
-        self.steps += 1
+        self.ahead = sorted([*self.ahead, self.steps if number is None else number])
+        while self.ahead and self.ahead[0] == self.steps:
+            self.steps += 1
+            del self.ahead[0]
         self.last_spp = step.spp
         self.seconds += seconds
         self.last_seconds = seconds
