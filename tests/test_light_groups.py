@@ -1,0 +1,303 @@
+"""Light groups: layers that sum to the image, and are what their lamps alone would give; mixes."""
+
+import itertools
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from manylights.errors import UsageError
+from manylights.loading.light_groups import as_text, entry_of
+from manylights.output import light_groups
+
+from tests import statistics_tools as tools
+from tests.conftest import require_variant
+
+pytestmark = pytest.mark.usefixtures("plugin")
+
+GROUPS = "key=lamp_[0-3],bulbs=bulb_*,sky=sky,sun=sun"
+
+NAMES = ["bulbs", "key", "rest", "sky", "sun"]
+
+PLUGINS = ["manylights_direct", "manylights_volpath"]
+
+
+def lamps(count=8, radiance=4.0):
+    """Small squares above the floor."""
+    generator = np.random.default_rng(1)
+    result = {}
+    for index in range(count):
+        place = generator.uniform([-2, 1, -2], [2, 2.5, 2])
+        frame = mi.ScalarTransform4f().translate(place.tolist()).rotate([1, 0, 0], 90)
+        color = (radiance * generator.uniform(0.5, 1, 3)).tolist()
+        emitter = {"type": "area", "radiance": {"type": "rgb", "value": color}}
+        result[f"lamp_{index}"] = {
+            "type": "rectangle",
+            "to_world": frame.scale(0.3),
+            "emitter": emitter,
+        }
+    return result
+
+
+def bulbs(count=6, intensity=0.5):
+    """Points."""
+    places = np.random.default_rng(2).uniform([-2, 1, -2], [2, 2, 2], (count, 3)).tolist()
+    return {
+        f"bulb_{index}": {"type": "point", "position": place, "intensity": intensity}
+        for index, place in enumerate(places)
+    }
+
+
+def stage(fog=False, size=(24, 16), filter_type="box", pixel_format="rgb"):
+    """A floor, a mirror ball and a camera, without lights."""
+    look_at = mi.ScalarTransform4f().look_at([0, 2, 6], [0, 0.7, 0], [0, 1, 0])
+    floor = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(4)
+    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "pixel_format": pixel_format}
+    film |= {"component_format": "float32", "rfilter": {"type": filter_type}}
+    camera = {"type": "perspective", "fov": 45, "to_world": look_at, "film": film}
+    scene = {
+        "type": "scene",
+        "camera": camera,
+        "floor": {"type": "rectangle", "to_world": floor, "bsdf": {"type": "diffuse"}},
+        "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7},
+    }
+    scene["ball"]["bsdf"] = {"type": "roughconductor", "alpha": 0.3}
+    if fog:
+        scene["fog"] = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.1}
+        frame = mi.ScalarTransform4f().scale(20)
+        scene["air"] = {"type": "cube", "to_world": frame, "bsdf": {"type": "null"}}
+        scene["air"]["interior"] = camera["medium"] = {"type": "ref", "id": "fog"}
+    return scene
+
+
+def all_lights():
+    """Lights of all kinds that bring light in different ways."""
+    sun = {"type": "directional", "direction": [1, -2, 0.3], "irradiance": 0.4}
+    ball = {"type": "sphere", "center": [-1.5, 1, 0], "radius": 0.2}
+    ball["emitter"] = {"type": "area", "radiance": 2.0}
+    return (
+        lamps()
+        | bulbs()
+        | {"sky": {"type": "constant", "radiance": 0.1}, "sun": sun, "ball_0": ball}
+    )
+
+
+def layers_of(image, names, color):
+    """The layers of a colour in an image with these channels."""
+    return [image[..., names.index(name)] for name in light_groups.of_color(names, color)]
+
+
+def rendered(scene, parameters, spp=4, seed=1):
+    """An image, and the names of its channels."""
+    integrator = mi.load_dict(parameters)
+    image = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
+    colors = ["R", "G", "B", "A"] if image.shape[2] % 3 == 1 else ["R", "G", "B"]
+    return image, colors + integrator.aov_names()
+
+
+# ------------------------------------------------------------------------------ Layers of mi.render
+
+
+CASES = [
+    *((plugin, False, {}) for plugin in PLUGINS),
+    ("manylights_direct", False, {"method": "tree", "bsdf_samples": 6}),
+    ("manylights_direct", False, {"method": "adaptive_splitting"}),
+    ("manylights_direct", False, {"method": "exhaustive", "reservoirs": 64}),
+    ("manylights_volpath", False, {"hide_emitters": True, "max_depth": 3}),
+    ("manylights_volpath", True, {}),
+    ("manylights_volpath", True, {"splitting_rate": 4, "counts": True}),
+]
+
+
+@pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_rgb"])
+@pytest.mark.parametrize(("plugin_name", "fog", "more"), CASES)
+def test_layers_sum_to_the_image_which_is_that_without(name, plugin_name, fog, more):
+    require_variant(name)
+    check_layers(plugin_name, fog, more)
+
+
+def test_layers_are_red_green_and_blue_in_all_variants(variant):
+    check_layers("manylights_volpath", False, {})
+
+
+def check_layers(plugin_name, fog, more):
+    """Check that layers sum to the image, which has the bits of one without layers.
+
+    But where something is learnt, since dim groups get more samples then.
+    """
+    scene = mi.load_dict(stage(fog) | all_lights())
+    parameters = {"type": plugin_name, **more}
+    if more.get("method", "resampled_tree") == "resampled_tree":
+        parameters["learn_visibility"] = False
+    plain, _ = rendered(scene, parameters)
+    image, names = rendered(scene, parameters | {"light_groups": GROUPS})
+    assert light_groups.groups(names) == NAMES
+    np.testing.assert_array_equal(image[..., : plain.shape[2]], plain)
+    for color in light_groups.RGB:
+        layers = layers_of(image, names, color)
+        total, beauty = light_groups.total(layers), image[..., names.index(color)]
+        np.testing.assert_allclose(total, beauty, rtol=1e-5, atol=1e-6 * beauty.max())
+        assert all(layer.max() > 0 for layer in layers)
+
+
+@pytest.mark.parametrize("plugin_name", PLUGINS)
+def test_a_layer_is_what_its_lamps_alone_give(scalar, plugin_name):
+    compare_with_lamps_alone(plugin_name, fog=False)
+
+
+@pytest.mark.slow
+def test_a_layer_in_fog_is_what_its_lamps_alone_give(llvm):
+    compare_with_lamps_alone("manylights_volpath", fog=True, spp=1024)
+
+
+def only(lights, groups, group):
+    """Lights of which those of other groups are off: their shapes are left."""
+    result = {}
+    for name, light in lights.items():
+        if entry_of(groups, name) == {"key": 0, "bulbs": 1, "rest": None}[group]:
+            result[name] = light
+        elif "emitter" in light:
+            result[name] = {key: part for key, part in light.items() if key != "emitter"}
+            result[name]["bsdf"] = {"type": "diffuse", "reflectance": 0.0}
+    return result
+
+
+def compare_with_lamps_alone(plugin_name, fog, spp=64):
+    """Compare each layer with renders of its lamps, and with ones that are a little brighter."""
+    lights, groups = all_lights(), as_text({"key": "lamp_[0-3]", "bulbs": "bulb_*"})
+    parameters = {"type": plugin_name} | ({"max_depth": 4} if "volpath" in plugin_name else {})
+    integrator = mi.load_dict(parameters | {"light_groups": groups})
+    names = ["R", "G", "B", *integrator.aov_names()]
+    scene, seeds = mi.load_dict(stage(fog) | lights), range(12)
+    images = tools.render_seeds(scene, integrator, spp=spp, seeds=seeds)
+    for group in ("key", "bulbs", "rest"):
+        alone = mi.load_dict(stage(fog) | only(lights, groups, group))
+        expected = tools.render_seeds(alone, mi.load_dict(parameters), spp, range(100, 112))
+        layer = images[..., [names.index(f"RGBA_{group}.{color}") for color in "RGB"]]
+        tools.assert_same_mean(layer, expected, bias=0.1, label=group)
+        assert not tools.compare_means(layer * 1.1, expected).passes, group
+
+
+def test_a_lamp_belongs_to_the_first_entry_that_fits_its_id_or_that_of_its_shape(scalar):
+    lights = bulbs(2)
+    lights["a"] = lamps(1, radiance=1e4)["lamp_0"]
+    lights["a"]["emitter"]["id"] = "b"
+    scene = mi.load_dict(stage() | lights)
+    for groups, group in (("x=a", "x"), ("x=b", "x"), ("y=bulb_*,x=*", "x"), ("y=?,x=*", "y")):
+        parameters = {"type": "manylights_direct", "light_groups": groups}
+        image, names = rendered(scene, parameters)
+        lit = {
+            name: image[..., names.index(f"RGBA_{name}.R")].max() > 10
+            for name in ("x", "y")
+            if name in groups
+        }
+        assert [name for name in lit if lit[name]] == [group], groups
+
+
+def test_weights_of_a_sensor_are_part_of_the_layers(scalar):
+    scene = stage() | all_lights()
+    scene["camera"] = {
+        "type": "distant",
+        "direction": [0, -1, 0],
+        "film": scene["camera"]["film"] | {"width": 1, "height": 1},
+    }
+    image, names = rendered(
+        mi.load_dict(scene), {"type": "manylights_direct", "light_groups": GROUPS}
+    )
+    total = light_groups.total(layers_of(image, names, "R"))
+    np.testing.assert_allclose(total, image[..., 0], rtol=1e-5)
+
+
+# --------------------------------------------------------------------------------------- Mistakes
+
+
+MISTAKES = [
+    ("key", "entries as"),
+    ("key=", "entries as"),
+    ("key=a,,b=c", "entries as"),
+    ("=lamp_0", "letters, digits"),
+    ("a b=lamp_0", "letters, digits"),
+    ("a.b=lamp_0", "letters, digits"),
+    ("rest=lamp_0", '"rest"'),
+    ("key=[lamp", "each \\["),
+    ("key=lamp_[!]", "each \\["),
+    (",".join(f"g{index}=lamp_0" for index in range(17)), "at most 16 groups"),
+]
+
+
+@pytest.mark.parametrize(("groups", "words"), MISTAKES)
+def test_wrong_groups_are_refused_when_the_scene_is_loaded(scalar, groups, words):
+    with pytest.raises(RuntimeError, match=f'"light_groups" is .*{words}'):
+        mi.load_dict({"type": "manylights_volpath", "light_groups": groups})
+
+
+@pytest.mark.parametrize(
+    "groups", ["key=lamp", "key=lamp_0,other=lamp_0", "key=lamp_*,win=window_*"]
+)
+def test_a_group_without_lights_is_an_error(scalar, groups):
+    entry = groups.split(",")[-1]
+    with pytest.raises(
+        RuntimeError, match=f'"{entry.replace("*", ".")}" matches no light.*"bulb_0"'
+    ):
+        rendered(
+            mi.load_dict(stage() | bulbs(1) | lamps(2)),
+            {"type": "manylights_direct", "light_groups": groups},
+        )
+
+
+def test_sixteen_groups_are_allowed_and_no_lights_at_all_need_none(scalar):
+    groups = ",".join(f"g{index}=lamp_{index}" for index in range(16))
+    image, names = rendered(
+        mi.load_dict(stage() | lamps(20)), {"type": "manylights_direct", "light_groups": groups}
+    )
+    total = light_groups.total(layers_of(image, names, "G"))
+    np.testing.assert_allclose(total, image[..., 1], rtol=1e-5)
+    assert image.shape[2] == 3 + 3 * 17
+
+
+def test_patterns_fit_as_those_of_file_names():
+    core = pytest.importorskip("manylights._core")
+    generator = np.random.default_rng(3)
+    texts = ["".join(generator.choice(list("ab-"), generator.integers(0, 6))) for _ in range(60)]
+    patterns = [
+        "".join(generator.choice(["a", "b", "*", "?", "[a-b]", "[!a]", "[b-]"], n))
+        for n in (1, 2, 3, 4, 5)
+        for _ in range(12)
+    ]
+    fits = 0
+    for pattern, text in itertools.product(patterns, texts):
+        entry, group = core.light_group(f"x={pattern}", text, "\n")
+        found = entry_of(f"x={pattern}", text, "\n") if "\n" else None
+        assert group == ("x" if entry == 0 else "rest")
+        assert (entry == 0) == (found == 0), (pattern, text)
+        fits += entry == 0
+    assert fits > 100
+
+
+def test_groups_can_be_a_dictionary():
+    assert as_text({"key": "lamp_*", "win": ["a", "b"]}) == "key=lamp_*,win=a,win=b"
+    for wrong in ({"key": []}, {"key": 3}, {"key": "a,b"}, 5):
+        with pytest.raises(UsageError):
+            as_text(wrong)
+
+
+# -------------------------------------------------------------------------------- Noise
+
+
+def test_the_noise_of_dim_groups_is_evened_without_bias(scalar):
+    # A thousandth of the light comes from every second lamp.
+    lights = lamps(24, radiance=10.0)
+    for name, lamp in list(lights.items())[::2]:
+        lights[name.replace("lamp", "dim")] = lights.pop(name)
+        lamp["emitter"]["radiance"]["value"] = [0.01, 0.01, 0.01]
+    scene = mi.load_dict(stage() | lights)
+    parameters = {"type": "manylights_direct", "light_groups": "dim=dim_*", "shadow_rays": 2}
+    images, noises = [], []
+    for learn in (False, True):
+        integrator = mi.load_dict(parameters | {"learn_visibility": learn})
+        dim = ["R", "G", "B", *integrator.aov_names()].index("RGBA_dim.R")
+        found = tools.render_seeds(scene, integrator, spp=64, seeds=range(16))
+        noises.append(found[..., dim].var(axis=0).mean())
+        images.append(found[..., [0, dim]])
+    assert noises[1] < 0.7 * noises[0]
+    tools.assert_same_mean(*images, bias=0.2)
+    assert not tools.compare_means(images[0] * 1.2, images[1]).passes
