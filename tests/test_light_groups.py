@@ -2,12 +2,14 @@
 
 import itertools
 
+import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
 from manylights.errors import UsageError
 from manylights.loading.light_groups import as_text, entry_of
-from manylights.output import light_groups
+from manylights.output import exr, light_groups
+from manylights.rendering import plan
 
 from tests import statistics_tools as tools
 from tests.conftest import require_variant
@@ -278,6 +280,112 @@ def test_groups_can_be_a_dictionary():
     for wrong in ({"key": []}, {"key": 3}, {"key": "a,b"}, 5):
         with pytest.raises(UsageError):
             as_text(wrong)
+
+
+# ------------------------------------------------------------------------------------------- Files
+
+
+def check_file(path, groups=NAMES):
+    """Return channels and attributes of an image, which is the sum of its layers bit for bit."""
+    planes, attributes = exr.read(path)
+    assert light_groups.groups(planes) == groups
+    for color in "RGB":
+        total = np.zeros_like(planes[color])
+        for name in [name for name in planes if name.startswith("RGBA_") and name.endswith(color)]:
+            assert planes[name].dtype == np.float32
+            total += planes[name]
+        np.testing.assert_array_equal(total, planes[color])
+    return planes, attributes
+
+
+@pytest.fixture
+def short_steps(monkeypatch):
+    """Also small images are rendered in several steps."""
+    monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
+    monkeypatch.setattr(plan, "MOST_SAMPLES", dict.fromkeys(plan.MOST_SAMPLES, 2**10))
+
+
+@pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_rgb"])
+@pytest.mark.parametrize("plugin_name", PLUGINS)
+def test_files_sum_bit_for_bit_also_of_merged_lamps(name, plugin_name, tmp_path):
+    require_variant(name)
+    scene = stage(filter_type="gaussian", pixel_format="rgba") | all_lights()
+    scene["camera"]["film"]["component_format"] = "float16"
+    path = tmp_path / "a.exr"
+    result = manylights.render(
+        scene, integrator={"type": plugin_name}, spp=4, output=path, light_groups=GROUPS
+    )
+    assert any("12 meshes merged" in note or "8 meshes merged" in note for note in result.notes), (
+        result.notes
+    )
+    planes, _ = check_file(path)
+    np.testing.assert_array_equal(planes["RGBA_key.A"], planes["A"])
+    np.testing.assert_allclose(result.image[..., 0], planes["R"], rtol=1e-5)
+    assert path.with_suffix(".png").exists()
+
+
+def test_merged_lamps_stay_in_their_groups(scalar):
+    scene = (
+        stage()
+        | lamps()
+        | {"integrator": {"type": "manylights_direct", "light_groups": "a=lamp_[0-3],b=lamp_[45]"}}
+    )
+    merged = manylights.merge_emitters(scene)
+    assert merged.merged == {
+        "lamp_0": ["lamp_0", "lamp_1", "lamp_2", "lamp_3"],
+        "lamp_4": ["lamp_4", "lamp_5"],
+        "lamp_6": ["lamp_6", "lamp_7"],
+    }
+    scenes = mi.load_dict(scene), mi.load_dict(merged)
+    assert len(scenes[1].emitters()) == 3
+    apart, together = (np.array(mi.render(each, spp=4)) for each in scenes)
+    # Three of four channels: those of a, of b, of the others
+    assert (together[..., 3:].max(axis=(0, 1)) > 0).all()
+    np.testing.assert_allclose(together, apart, rtol=1e-4, atol=1e-6)
+
+
+def test_the_same_bits_in_parts_and_with_any_number_of_threads(scalar, tmp_path, short_steps):
+    scene, groups = stage(filter_type="gaussian") | all_lights(), as_text({"key": "lamp_[0-3]"})
+    options = {"spp": 16, "light_groups": groups, "output": tmp_path / "a.exr"}
+    one = manylights.render(scene, threads=1, **options)
+    planes, _ = check_file(tmp_path / "a.exr", ["key", "rest"])
+    for number in (1, 2):
+        result = manylights.render(scene, threads=2, part=(number, 2), **options)
+        assert result.files[0].name == f"a.part-{number:02}-of-02.exr" or result.files
+    parts = sorted(tmp_path.glob("a.part*.exr"))
+    merged = manylights.merge(parts, tmp_path / "merged.exr")
+    again, _ = check_file(tmp_path / "merged.exr", ["key", "rest"])
+    assert planes.keys() == again.keys()
+    for name, plane in planes.items():
+        np.testing.assert_array_equal(plane, again[name], err_msg=name)
+    assert merged.samples == one.samples
+    options["light_groups"] = as_text({"key": "lamp_[0-4]"})
+    (other,) = manylights.render(
+        scene, part=(2, 2), **{**options, "output": tmp_path / "b.exr"}
+    ).files
+    with pytest.raises(UsageError, match="light_groups"):
+        manylights.merge([parts[0], other])
+
+
+def test_means_of_finished_images_are_the_sum_of_their_layers(scalar, tmp_path):
+    scene = stage() | all_lights()
+    for seed in (1, 2):
+        manylights.render(
+            scene, spp=2, seed=seed, output=tmp_path / f"{seed}.exr", light_groups=GROUPS
+        )
+    manylights.merge([tmp_path / "1.exr", tmp_path / "2.exr"], tmp_path / "mean.exr")
+    check_file(tmp_path / "mean.exr")
+
+
+def test_objects_and_films_without_colours_have_no_light_groups(scalar):
+    scene = stage() | lamps()
+    with pytest.raises(UsageError, match="must be descriptions"):
+        manylights.render(mi.load_dict(scene), light_groups="key=lamp_*")
+    scene["camera"]["film"]["pixel_format"] = "luminance"
+    with pytest.raises(UsageError, match="has pixel_format y, layers need"):
+        manylights.render(scene, light_groups="key=lamp_*", spp=1)
+    with pytest.raises(UsageError, match="path has none"):
+        manylights.render(stage() | lamps(), integrator="path", light_groups="key=lamp_*", spp=1)
 
 
 # -------------------------------------------------------------------------------- Noise

@@ -90,6 +90,7 @@ def render(
     learnt: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
+    light_groups: str | dict[str, str | list[str]] | None = None,
 ) -> RenderResult:
     """Render a scene: a number of samples, or until an image is good enough or a time is up.
 
@@ -119,6 +120,11 @@ def render(
         progress: called before the first step and after each, in scalar variants also in between
             and from other threads. What it raises ends the render.
         threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
+        light_groups: groups of lights by patterns of ids, as ``"key=lamp_*,windows=facade"`` or
+            ``{"key": "lamp_*", "windows": ["facade", "pane_?"]}``: the image gets layers
+            ``RGBA_key.R``, ... with their light, and is the sum of them, bit for bit
+            (``output.light_groups``). All other lights are the group ``rest``. For a scene that is
+            read here, not for objects of Mitsuba. Default: what the integrator says.
 
     Raises:
         UsageError: (a ``ValueError``) a number out of range, no such file or sensor, no parts of
@@ -127,7 +133,8 @@ def render(
     """
     check("threads", threads, threads is None or threads >= 1, "1 or more")
     target = None if output is None else images.check_output(str(output))
-    loaded, own = loading.as_loaded(scene, integrator)
+    groups = None if light_groups is None else loading.light_groups.as_text(light_groups)
+    loaded, own = loading.as_loaded(scene, integrator, groups)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
