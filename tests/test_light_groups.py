@@ -6,6 +6,7 @@ import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
+from manylights import cli
 from manylights.errors import UsageError
 from manylights.loading.light_groups import as_text, entry_of
 from manylights.output import exr, light_groups
@@ -409,3 +410,98 @@ def test_the_noise_of_dim_groups_is_evened_without_bias(scalar):
     assert noises[1] < 0.7 * noises[0]
     tools.assert_same_mean(*images, bias=0.2)
     assert not tools.compare_means(images[0] * 1.2, images[1]).passes
+
+
+# -------------------------------------------------------------------------------------------- Mixes
+
+
+@pytest.fixture
+def image(scalar, tmp_path):
+    """A file with layers."""
+    path = tmp_path / "out.exr"
+    manylights.render(
+        stage(pixel_format="rgba") | all_lights(), spp=4, output=path, light_groups=GROUPS
+    )
+    return path
+
+
+def mix(*words):
+    """Run the command and return its exit status."""
+    return cli.main(["mix", *map(str, words)])
+
+
+def test_a_mix_is_exact(image, tmp_path):
+    target = tmp_path / "mixed.exr"
+    assert mix(image, "key=2", "sky=.5,.4,.3", "bulbs=0", "-o", target) == 0
+    before, _ = exr.read(image)
+    planes, attributes = check_file(target)
+    weights = {"key": [2, 2, 2], "sky": [0.5, 0.4, 0.3], "bulbs": [0, 0, 0]}
+    for group in NAMES:
+        for color, weight in zip("RGB", weights.get(group, [1, 1, 1])):
+            name = f"RGBA_{group}.{color}"
+            np.testing.assert_array_equal(planes[name], before[name] * np.float32(weight))
+    np.testing.assert_array_equal(planes["A"], before["A"])
+    assert planes.keys() == before.keys()
+    assert target.with_suffix(".png").exists()
+    assert exr.fact(attributes["manylights.mix"])["key"] == [2, 2, 2]
+    # Another one of it goes on from there
+    again = tmp_path / "again.exr"
+    assert mix(target, "key=.5", "-o", again) == 0
+    np.testing.assert_array_equal(check_file(again)[0]["RGBA_key.R"], before["RGBA_key.R"])
+    with pytest.raises(UsageError, match="mix"):
+        manylights.merge([image, target])
+
+
+def test_weights_of_one_leave_every_bit(image):
+    planes, _ = exr.read(image)
+    mixed = manylights.mix(image, {"key": 1.0})
+    for index, color in enumerate("RGB"):
+        np.testing.assert_array_equal(mixed.image[..., index], planes[color])
+
+
+def test_a_mix_is_the_render_with_other_lamps(scalar, tmp_path):
+    lights, path = lamps() | bulbs(), tmp_path / "a.exr"
+    changed = lamps(radiance=12.0) | bulbs(intensity=0.0)
+    mixes, renders = [], []
+    for seed in range(8):
+        manylights.render(
+            stage() | lights, spp=64, seed=seed, output=path, light_groups="key=lamp_*"
+        )
+        mixes.append(manylights.mix(path, {"key": 3, "rest": 0}).image)
+        renders.append(manylights.render(stage() | changed, spp=64, seed=seed + 50).image)
+    mixes, renders = np.stack(mixes).astype(float), np.stack(renders).astype(float)
+    tools.assert_same_mean(mixes, renders, bias=0.1)
+    assert not tools.compare_means(mixes * 1.1, renders).passes
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("windows=2",), "no light group windows, it has bulbs, key, rest, sky, sun"),
+        (("key=a",), "key=a: must be a number"),
+        (("key=1,2",), "one or three finite numbers"),
+        (("key=-1",), "one or three finite numbers"),
+        (("key=inf",), "one or three finite numbers"),
+        (("key=1e39",), "one or three finite numbers"),
+        (("key",), "mix key: write it as"),
+        (("key=1", "key=2"), "given twice"),
+    ],
+)
+def test_wrong_weights_are_refused(image, tmp_path, capsys, words, text):
+    assert mix(image, *words, "-o", tmp_path / "mixed.exr") == 2
+    assert text in capsys.readouterr().err
+    assert not (tmp_path / "mixed.exr").exists()
+
+
+def test_other_files_are_refused(scalar, tmp_path, capsys):
+    target = tmp_path / "mixed.exr"
+    foreign, plain, missing = (tmp_path / f"{name}.exr" for name in ("foreign", "plain", "missing"))
+    mi.Bitmap(np.ones((4, 4, 3), np.float32)).write(str(foreign))
+    manylights.render(stage() | lamps(), spp=1, output=plain)
+    for path, text in (
+        (foreign, "no render of manylights"),
+        (plain, "no light groups"),
+        (missing, "no such file"),
+    ):
+        assert mix(path, "key=1", "-o", target) == 2
+        assert text in capsys.readouterr().err

@@ -6,7 +6,19 @@ import argparse
 import os
 import sys
 
-from manylights.cli import bench, compare, convert, demo, info, merge, render, report, tree, version
+from manylights.cli import (
+    bench,
+    compare,
+    convert,
+    demo,
+    info,
+    merge,
+    mix,
+    render,
+    report,
+    tree,
+    version,
+)
 from manylights.errors import one_line
 from manylights.progress import INTERRUPTED
 
@@ -14,7 +26,7 @@ from manylights.progress import INTERRUPTED
 FAILURE = 2
 
 #: In the order of the help; each has ``add(commands, common)``.
-COMMANDS = (render, merge, info, tree, convert, demo, bench, compare, report)
+COMMANDS = (render, merge, mix, info, tree, convert, demo, bench, compare, report)
 
 
 def main(arguments: list[str] | None = None) -> int:
