@@ -69,6 +69,11 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
      should arrive by what is known of their visibility, all of it where nothing is known, 0
      where shadow rays are traced to all lights. (Default: no, i.e. |false|)
 
+ * - light_groups
+   - |string|
+   - Groups of lights whose light has film layers of its own, see below:
+     :code:`key=lamp_*,windows=facade`. (Default: none)
+
  * - plan, visibility.counts
    - |int| array
    - Passes of a job and what it has learnt, see below.
@@ -144,6 +149,17 @@ training passes have taught; written to another integrator, it renders the same 
 sampler :monosp:`manylights_sobol` are parts of one sequence for each pixel; of other samplers, each
 has a pattern of its own. An empty plan ends the job.
 
+**Light groups.** :code:`light_groups` is a list of :code:`group=pattern`, separated by commas. A
+light belongs to the group of the first entry whose pattern (:code:`*`, :code:`?`, :code:`[a-z]`,
+:code:`[!a-z]`) its id fits, or that of its shape; all others are the group :code:`rest`. A group may
+have several entries; there are at most 16 groups. The film gets the channels
+:code:`RGBA_key.R`, :code:`RGBA_key.G`, :code:`RGBA_key.B` and so on, in the order of their names:
+all light that begins in the lamps of the group, from the same samples as the image, which is their
+sum up to rounding. They are red, green and blue in any film. Where visibility is learnt, the
+brightness of each group is, too, as the last entries of :code:`visibility.counts`: targets
+:math:`g_i` are then divided by its square root (1/32 at most), so that the noise of dim groups is
+about as large as that of bright ones in relation to their light.
+
 Emitters of all kinds are supported. Point and spot lights and area lights on meshes, spheres,
 disks and cylinders are evaluated without virtual function calls, so that kernels do not grow
 with the number of lights; other emitters, and radiance that varies over a triangle, are
@@ -179,30 +195,39 @@ using DirectBase = manylights::LightIntegrator<Float, Spectrum, SamplingIntegrat
 template <typename Float, typename Spectrum>
 class ManyLightsDirect final : public DirectBase<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(DirectBase, m_hide_emitters, m_params, m_cache)
+    MI_IMPORT_BASE(DirectBase, m_hide_emitters, m_params, m_cache, no_light, write_layers)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium, BSDF, BSDFPtr)
     using DirectLight = manylights::DirectLight<Float, Spectrum>;
+    using GroupLight  = manylights::GroupLight<Float, Spectrum>;
+    using GroupSums   = typename Base::Sums;
 
     ManyLightsDirect(const Properties &props)
         : Base(props, manylights::read_parameters(props)) {}
 
-    std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
-                                     const RayDifferential3f &ray, const Medium *,
-                                     Float *aovs, Mask active) const override {
+    std::pair<Spectrum, Mask> sample_weighted(const Scene *scene, Sampler *sampler,
+                                              const RayDifferential3f &ray,
+                                              const Spectrum *weight, const Medium *,
+                                              Float *aovs, Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         auto lights = m_cache.get(scene, sampler);
         DirectLight direct(scene, *lights, m_params);
-        return manylights::differentiable<Float>(
-            sampler, (*lights).evaluates_loops(), [&] {
-                return manylights::call_flat<Float>(
-                    [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
+        GroupSums groups;
+        auto result =
+            manylights::differentiable<Float>(sampler, (*lights).evaluates_loops(), [&] {
+                groups = no_light(*lights);
+                return manylights::call_flat<Float>([&] {
+                    return radiance(scene, direct, sampler, ray, groups, aovs, active);
+                });
             });
+        write_layers(groups, weight, ray, aovs, active);
+        return result;
     }
 
     /// Radiance along a ray, and whether it met anything
     std::pair<Spectrum, Mask> radiance(const Scene *scene, const DirectLight &direct,
                                        Sampler *sampler, const RayDifferential3f &ray,
-                                       Float *aovs, Mask active) const {
+                                       GroupSums &groups, Float *aovs,
+                                       Mask active) const {
         auto pi = scene->ray_intersect_preliminary(ray, /* coherent = */ true, active);
         if (m_hide_emitters)
             manylights::skip_emitters(scene, Ray3f(ray), pi, active);
@@ -213,6 +238,11 @@ public:
             result = direct.emission().emitted(si, direct.emission().light_at(si, active),
                                                active);
 
+        GroupLight light(groups);
+        if (light.is_wanted()) {
+            light.set_factor(Spectrum(1.f));
+            light.add(result, direct.groups().of_hit(si), active);
+        }
         active &= si.is_valid();
         Mask valid_ray = active;
         manylights::Counts<Float> counts;
@@ -229,11 +259,11 @@ public:
         auto vertex  = direct.prepare(si, bsdf, nullptr, u, true, active);
         Mask lit     = vertex.is_lit_surface(active);
         if (dr::any_or<true>(lit))
-            result += direct.sample_lights(vertex, counts, lit);
+            result += direct.sample_lights(vertex, counts, light, lit);
         if (m_params.counts)
             counts.write(aovs, m_params);
         if (direct.needs_bsdf_samples())
-            result += direct.sample_bsdf(vertex, sampler, active);
+            result += direct.sample_bsdf(vertex, sampler, light, active);
         return { result, valid_ray };
     }
 

@@ -65,6 +65,11 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
      :code:`expected` as :monosp:`manylights_direct`, summed over the vertices.
      (Default: no, i.e. |false|)
 
+ * - light_groups
+   - |string|
+   - Groups of lights whose light has film layers of its own, see
+     :monosp:`manylights_direct`: :code:`key=lamp_*,windows=facade`. (Default: none)
+
  * - plan, visibility.counts
    - |int| array
    - Passes of a job and what it has learnt, see :monosp:`manylights_direct`.
@@ -152,29 +157,37 @@ using PathBase = manylights::LightIntegrator<Float, Spectrum, MonteCarloIntegrat
 template <typename Float, typename Spectrum>
 class ManyLightsVolpath final : public PathBase<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(PathBase, m_max_depth, m_rr_depth, m_hide_emitters, m_params, m_cache)
+    MI_IMPORT_BASE(PathBase, m_max_depth, m_rr_depth, m_hide_emitters, m_params, m_cache,
+                   no_light, write_layers)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium)
     using PathTracer   = manylights::PathTracer<Float, Spectrum>;
     using MediumReader = manylights::MediumReader<Float, Spectrum>;
+    using GroupSums    = typename Base::Sums;
 
     ManyLightsVolpath(const Properties &props)
         : Base(props, manylights::read_path_parameters(props)) {}
 
-    std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
-                                     const RayDifferential3f &ray, const Medium *medium,
-                                     Float *aovs, Mask active) const override {
+    std::pair<Spectrum, Mask> sample_weighted(const Scene *scene, Sampler *sampler,
+                                              const RayDifferential3f &ray,
+                                              const Spectrum *weight,
+                                              const Medium *medium, Float *aovs,
+                                              Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         auto lights = m_cache.get(scene, sampler);
         auto media  = MediumReader::with((*lights).media(), scene, medium);
         PathTracer tracer(scene, *lights, media, m_params,
                           { m_max_depth, m_rr_depth, m_hide_emitters });
         manylights::Counts<Float> counts;
+        GroupSums groups;
         auto result =
             manylights::differentiable<Float>(sampler, (*lights).evaluates_loops(), [&] {
+                groups = no_light(*lights);
                 return manylights::call_flat<Float>([&] {
-                    return tracer.trace(sampler, Ray3f(ray), medium, counts, active);
+                    return tracer.trace(sampler, Ray3f(ray), medium, counts, groups,
+                                        active);
                 });
             });
+        write_layers(groups, weight, ray, aovs, active);
         if (m_params.counts)
             counts.write(aovs, m_params);
         return result;

@@ -35,6 +35,8 @@ def documented(text):
 def default_in_words(about):
     """The end of what the documentation says of a parameter."""
     value = about["default"]
+    if not value:
+        return "(Default: none)"
     if about["type"] == "bool":
         value = {"true": "yes, i.e. |true|", "false": "no, i.e. |false|"}[value]
     return f"(Default: :code:`{value}`)" if about["type"] == "string" else f"(Default: {value})"
@@ -58,7 +60,7 @@ def range_in_words(about):
     if about["type"] == "bool":
         return either(["true", "false", *about["texts"]])
     if about["type"] == "string":
-        return either(about["texts"])
+        return either(about["texts"]) if about["texts"] else "text"
     if about["type"] == "float":
         return either([f"float >= {about['low']:g}", *about["texts"]])
     if about["high_name"]:

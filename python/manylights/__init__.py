@@ -13,11 +13,12 @@ The order of ``import manylights`` and ``mi.set_variant`` does not matter: Mitsu
 path for the whole process and reads it whenever a scene asks for a plugin.
 
 ``manylights.plugin_dir()`` is the folder for ``mitsuba -a``; ``manylights.render`` has all that the
-command ``manylights render`` has, and ``manylights.merge`` adds what several machines have
-rendered; ``manylights.scenes`` generates scenes; ``manylights.power_sampling(scene)`` makes
-Mitsuba's own integrators choose emitters by power, for comparisons.
-``manylights.merge_emitters(description)`` makes scenes with thousands of separate lamps start in
-seconds. ``manylights.usd.load(path)`` reads USD stages, with ``usd-core``.
+command ``manylights render`` has, ``manylights.merge`` adds what several machines have rendered,
+and ``manylights.mix`` makes groups of lamps brighter or darker afterwards; ``manylights.scenes``
+generates scenes; ``manylights.power_sampling(scene)`` makes Mitsuba's own integrators choose
+emitters by power, for comparisons. ``manylights.merge_emitters(description)`` makes scenes with
+thousands of separate lamps start in seconds. ``manylights.usd.load(path)`` reads USD stages, with
+``usd-core``.
 
 What is where, each using only those before it:
 
@@ -43,17 +44,19 @@ register()
 from manylights import scenes  # noqa: E402
 from manylights.loading.merging import merge_emitters  # noqa: E402
 from manylights.power import power_sampling, power_weights  # noqa: E402
-from manylights.rendering import Merged, Progress, RenderResult, merge, render  # noqa: E402
+from manylights.rendering import Merged, Mixed, Progress, RenderResult, merge, mix, render  # noqa: E402
 
 __version__ = "0.1.0"
 __all__ = [
     "REQUIRED_MITSUBA",
     "Merged",
+    "Mixed",
     "Progress",
     "RenderResult",
     "__version__",
     "merge",
     "merge_emitters",
+    "mix",
     "plugin_dir",
     "power_sampling",
     "power_weights",

@@ -29,6 +29,7 @@ public:
             m_data[i] = other.m_data[i];
         return *this;
     }
+    size_t size() const { return m_size; }
     T &operator[](size_t i) { return m_data[i]; }
     const T &operator[](size_t i) const { return m_data[i]; }
 

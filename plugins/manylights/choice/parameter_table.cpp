@@ -39,6 +39,9 @@ Parameter text(std::string_view name, Texts texts) {
     return { name, kBoth, Type::Text, 0, 0, 0, "", texts, {}, false, "" };
 }
 
+/// Any text, none if it is not given
+Parameter free_text(std::string_view name) { return text(name, {}); }
+
 /// With its meaning, and the methods that it is for (none: all)
 Parameter with(Parameter p, std::string_view meaning, std::vector<Method> methods = {}) {
     p.meaning = meaning;
@@ -71,6 +74,7 @@ std::vector<Parameter> make_table() {
         with(boolean("learn_visibility", kBoth, true, { "keep" }),
              "learn which lights can be seen from where", { M::ResampledTree }),
         with(boolean("counts", kBoth, false), "film channels with numbers of candidates"),
+        with(free_text("light_groups"), "film layers with the light of groups"),
         with(integer("bsdf_samples", kDirect, 1, 0, 1024), "rays sampled from the BSDF"),
         inherited(integer("max_depth", kVolpath, -1, -1, kInfinity), "longest path"),
         inherited(integer("rr_depth", kVolpath, 5, 1, kInfinity),
@@ -102,7 +106,7 @@ std::string Parameter::allowed(double high) const {
 
 std::string Parameter::text_of(double value) const {
     if (type == Type::Text)
-        return std::string(texts[(size_t) value]);
+        return texts.empty() ? "" : std::string(texts[(size_t) value]);
     if (type == Type::Boolean)
         return value > 1 ? std::string(texts[0]) : value > 0 ? "true" : "false";
     std::ostringstream oss;

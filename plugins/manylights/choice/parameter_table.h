@@ -28,7 +28,7 @@ struct Parameter {
     /// Range of numbers; the parameter of this name, if any, is the upper end instead
     double low, high;
     std::string_view high_name;
-    /// What a text may be, or else what may be given in place of a boolean (with the value 2) or a
+    /// What a text may be (none: anything), or else what may be given in place of a boolean (with the value 2) or a
     /// number (infinity)
     std::vector<std::string_view> texts;
     /// Methods in which it has an effect; given with others it is a mistake

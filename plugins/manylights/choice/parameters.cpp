@@ -78,6 +78,15 @@ template <typename Params, typename F> void for_each_member(Params &p, const F &
     f("bsdf_samples", p.bsdf_samples);
 }
 
+GroupNames read_groups(const Properties &props) {
+    std::string text = props.get<std::string>("light_groups", "");
+    try {
+        return text.empty() ? GroupNames() : GroupNames(text);
+    } catch (const std::invalid_argument &error) {
+        refuse(props, parameter("light_groups"), quoted(text), error.what());
+    }
+}
+
 SamplingParameters read(const Properties &props, Plugins plugin) {
     SamplingParameters p{};
     p.plugin = plugin;
@@ -93,6 +102,7 @@ SamplingParameters read(const Properties &props, Plugins plugin) {
         }
         member = (Value) value;
     });
+    p.light_groups = read_groups(props);
     // What the method does without
     if (p.method == Method::Exhaustive)
         p.splitting_rate = std::numeric_limits<float>::infinity();
@@ -134,6 +144,8 @@ std::string to_string(const SamplingParameters &p) {
             oss << (oss.tellp() > 0 ? ",\n" : "") << name << " = "
                 << about.text_of((double) member);
     });
+    if (!p.light_groups.empty())
+        oss << ",\nlight_groups = " << quoted(p.light_groups.text());
     return oss.str();
 }
 

@@ -5,6 +5,7 @@
  * parameter_table.cpp.
  */
 
+#include "group_names.h"
 #include "parameter_table.h"
 #include <algorithm>
 #include <cmath>
@@ -39,6 +40,8 @@ struct SamplingParameters {
     /// Are the candidates and the visited nodes counted, in film channels?
     bool counts;
     LearnVisibility learn_visibility;
+    /// Groups of lights that have film layers of their own
+    GroupNames light_groups;
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {

@@ -24,12 +24,14 @@ namespace manylights {
 template <typename Float, typename Spectrum> class DirectLight {
 public:
     MI_IMPORT_TYPES(Scene, Sampler, BSDF, BSDFPtr)
-    using Lights  = SceneLights<Float, Spectrum>;
-    using FloatD  = typename Lights::FloatD;
-    using UInt32D = typename Lights::UInt32D;
-    using MaskD   = typename Lights::MaskD;
-    using Media   = manylights::Media<Float, Spectrum>;
-    using Vertex  = manylights::Vertex<Float, Spectrum>;
+    using Lights     = SceneLights<Float, Spectrum>;
+    using FloatD     = typename Lights::FloatD;
+    using UInt32D    = typename Lights::UInt32D;
+    using MaskD      = typename Lights::MaskD;
+    using Media      = manylights::Media<Float, Spectrum>;
+    using Vertex     = manylights::Vertex<Float, Spectrum>;
+    using GroupLight = manylights::GroupLight<Float, Spectrum>;
+    using GroupSums  = typename GroupLight::Sums;
 
     DirectLight(const Scene *scene, const Lights &lights,
                 const SamplingParameters &params, const MediaKinds &media = {})
@@ -49,6 +51,7 @@ public:
 
     const SceneEmission<Float, Spectrum> &emission() const { return m_emission; }
     const Media &media() const { return m_media; }
+    const LightGroups<Float, Spectrum> &groups() const { return m_lights.groups(); }
 
     /// Which random numbers are needed besides points on lights?
     bool uses_tree() const { return m_strategy.source != Source::AllLights; }
@@ -102,38 +105,42 @@ public:
     }
 
     /// Radiance that arrives from sampled lights, reflected towards -si.wi
-    Spectrum sample_lights(const Vertex &vertex, Counts<Float> &counts,
+    Spectrum sample_lights(const Vertex &vertex, Counts<Float> &counts, GroupLight &light,
                            Mask active) const {
         if (m_strategy.items == 0)
             return Spectrum(0.f);
         if (m_strategy.fate_at(vertex.effort) == Fate::TraceAll)
-            return m_rays.trace_candidates(vertex, counts, active);
-        return m_rays.trace_kept(vertex, m_kept.keep(vertex, counts, active), active);
+            return m_rays.trace_candidates(vertex, counts, light, active);
+        return m_rays.trace_kept(vertex, m_kept.keep(vertex, counts, active), light,
+                                 active);
     }
 
     /// Radiance that arrives along rays sampled from the BSDF
-    Spectrum sample_bsdf(const Vertex &vertex, Sampler *sampler, Mask active) const {
-        Spectrum result(0.f);
-        if (m_strategy.params.bsdf_samples <= kUnrolledRays) {
-            for (uint32_t i = 0; i < m_strategy.params.bsdf_samples; ++i)
-                add_bsdf_sample(vertex, sampler, result, active);
-            return result;
-        }
+    Spectrum sample_bsdf(const Vertex &vertex, Sampler *sampler, GroupLight &light,
+                         Mask active) const {
         struct State {
             UInt32 ray;
             Spectrum result;
             Sampler *sampler;
-            DRJIT_STRUCT(State, ray, result, sampler)
+            GroupSums groups;
+            DRJIT_STRUCT(State, ray, result, sampler, groups)
         };
-        State state{ UInt32(0), result, sampler };
+        State state{ UInt32(0), Spectrum(0.f), sampler, light.take() };
+        if (m_strategy.params.bsdf_samples <= kUnrolledRays) {
+            for (uint32_t i = 0; i < m_strategy.params.bsdf_samples; ++i)
+                add_bsdf_sample(vertex, state, light, active);
+            light.give(std::move(state.groups));
+            return state.result;
+        }
         UInt32 rays = dr::opaque<UInt32>(m_strategy.params.bsdf_samples);
         loop(
             state, [&](const State &s) { return active && s.ray < rays; },
             [&](State &s) {
-                add_bsdf_sample(vertex, s.sampler, s.result, active);
+                add_bsdf_sample(vertex, s, light, active);
                 s.ray += 1u;
             },
             "Direct light: rays from the BSDF");
+        light.give(std::move(state.groups));
         return state.result;
     }
 
@@ -170,13 +177,14 @@ private:
             vertex.top = TopWeights<FloatD>(tree, vertex.at);
     }
 
-    void add_bsdf_sample(const Vertex &vertex, Sampler *sampler, Spectrum &result,
+    template <typename State>
+    void add_bsdf_sample(const Vertex &vertex, State &s, const GroupLight &groups,
                          Mask active) const {
         const SurfaceInteraction3f &si = vertex.si;
         mitsuba::BSDFContext ctx;
         // In this order with all compilers
-        Point2f u2       = sampler->next_2d(active);
-        Float u1         = sampler->next_1d(active);
+        Point2f u2       = s.sampler->next_2d(active);
+        Float u1         = s.sampler->next_1d(active);
         auto [bs, value] = vertex.bsdf->sample(ctx, si, u1, u2, active);
         value            = si.to_world_mueller(value, -bs.wo, si.wi);
         Mask reflected   = active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
@@ -191,9 +199,13 @@ private:
         Float light_pdf = dr::select(
             delta, 0.f,
             hit_density(vertex.at, vertex.u.tree, true, hit, light, reflected && !delta));
-        Float pdf = bs.pdf * (float) m_strategy.params.bsdf_samples;
-        result[reflected] += value * radiance * mis_weight<Float>(pdf, light_pdf) /
-                             (float) m_strategy.params.bsdf_samples;
+        Float pdf        = bs.pdf * (float) m_strategy.params.bsdf_samples;
+        Spectrum arrives = value * radiance * mis_weight<Float>(pdf, light_pdf) /
+                           (float) m_strategy.params.bsdf_samples;
+        s.result[reflected] += arrives;
+        if (s.groups.size() > 0)
+            groups.add(s.groups, arrives, Float(1.f), m_lights.groups().of_hit(hit),
+                       reflected);
     }
 
     const Lights &m_lights;

@@ -111,6 +111,8 @@ private:
                     if (m_strategy.params.counts)
                         s.expected +=
                             expected_light(weight * g, candidate.visibility, valid);
+                    if (m_lights.groups().evens())
+                        g *= evening(candidate.light, active && valid);
                     write_slot<FloatD>(kept.target, s.slot, weight * g, m_strategy.items,
                                        valid);
                 }
@@ -195,6 +197,10 @@ private:
                 if (m_strategy.params.counts)
                     s.expected +=
                         expected_light(weight * target, visibility, weight > 0.f);
+                if (m_lights.groups().evens())
+                    target *=
+                        evening(read_slot<UInt32D>(kept.light, s.slot, m_strategy.slots),
+                                active && weight > 0.f);
                 write_slot<FloatD>(s.target, s.slot, weight * target, m_strategy.items,
                                    true);
                 s.slot += 1u;
@@ -222,6 +228,13 @@ private:
             g            = dr::select(g > 0.f, g * far, 0.f); // else p is undefined
         }
         return g;
+    }
+
+    /// So that the light of dim groups is not noisier than that of others
+    FloatD evening(const UInt32D &light, const Mask &active) const {
+        const auto &groups = m_lights.groups();
+        MaskD on           = plain(active);
+        return groups.evening(groups.of_light(m_lights.tree(), light, on), on);
     }
 
     const Lights &m_lights;

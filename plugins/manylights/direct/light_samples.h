@@ -71,7 +71,7 @@ public:
         InfiniteSamples samples;
         float p = m_strategy.infinite_probability;
         for (uint32_t i = 0; i < m_strategy.infinite; ++i) {
-            Point2f u   = slot_point(vertex.u.point, UInt32D(m_strategy.slots + i));
+            Point2f u   = infinite_point(vertex, i);
             auto sample = [&](const Vertex &v) {
                 if (p == 1.f)
                     return sample_emitter(v, m_lights.infinite()[i], u, Float(1.f),
@@ -92,7 +92,21 @@ public:
         return samples;
     }
 
+    /// The group of light number i of \ref sample_infinite
+    UInt32D infinite_group(const Vertex &vertex, uint32_t i, Mask active) const {
+        UInt32D index(i);
+        if (m_strategy.infinite_probability != 1.f) {
+            Point2f u = infinite_point(vertex, i);
+            index     = plain(choose_infinite(u));
+        }
+        return m_lights.groups().of_infinite(index, plain(active));
+    }
+
 private:
+    Point2f infinite_point(const Vertex &vertex, uint32_t i) const {
+        return slot_point(vertex.u.point, UInt32D(m_strategy.slots + i));
+    }
+
     /**
      * f(vertex), a sample of a light. For a segment the vertex is moved to the distance t,
      * of density pdf, and the sample has the factor sigma_s exp(-sigma_t t) / pdf (for the
@@ -211,12 +225,19 @@ private:
         return Sample::make(f & active, weight & active, ds.p, ds.p);
     }
 
-    /// One of many lights at infinity, chosen at random
-    Sample sample_some_infinite(const Vertex &vertex, Point2f u, Mask active) const {
+    /// Which of many lights at infinity a number chooses; it can be used again then
+    dr::uint32_array_t<Float> choose_infinite(Point2f &u) const {
         using UInt32   = dr::uint32_array_t<Float>;
         uint32_t count = (uint32_t) m_lights.infinite().size();
         UInt32 index   = dr::minimum(UInt32(u.x() * (float) count), count - 1u);
         u.x()          = u.x() * (float) count - Float(index);
+        return index;
+    }
+
+    /// One of many lights at infinity, chosen at random
+    Sample sample_some_infinite(const Vertex &vertex, Point2f u, Mask active) const {
+        uint32_t count = (uint32_t) m_lights.infinite().size();
+        auto index     = choose_infinite(u);
         EmitterPtr emitter =
             dr::gather<EmitterPtr>(m_lights.infinite_dr(), index, active);
         Sample sample = sample_emitter(vertex, emitter, u,

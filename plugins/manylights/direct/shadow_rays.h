@@ -8,6 +8,7 @@
  * Estimate = sum over the chosen of V C F max(1, tau / g), g the target, tau the step.
  */
 
+#include "group_light.h"
 #include "kept_lights.h"
 #include "manylights/learning/visibility.h"
 #include "manylights/scene/media.h"
@@ -29,6 +30,8 @@ public:
     using UInt32D         = typename Lights::UInt32D;
     using MaskD           = typename Lights::MaskD;
     using Rng             = VertexRng<FloatD>;
+    using GroupLight      = manylights::GroupLight<Float, Spectrum>;
+    using GroupSums       = typename GroupLight::Sums;
 
     ShadowRays(const Scene *scene, const Lights &lights, const Media &media,
                const Strategy &strategy, const Samples &samples)
@@ -36,15 +39,20 @@ public:
           m_samples(samples) {}
 
     /// A shadow ray for each kept light, or for some of them
-    MI_NOINLINE Spectrum trace_kept(const Vertex &vertex, Kept kept, Mask active) const {
+    MI_NOINLINE Spectrum trace_kept(const Vertex &vertex, Kept kept, GroupLight &light,
+                                    Mask active) const {
         // Find the step tau of the systematic sampling, lights at infinity included
         InfiniteSamples infinite = m_samples.sample_infinite(vertex, active);
         FloatD offset            = plain(vertex.u.selection);
         FloatD tau(0.f);
         if (m_strategy.chooses) {
-            for (size_t i = 0; i < m_strategy.infinite; ++i)
-                kept.target[m_strategy.slots + i] =
-                    m_samples.target(infinite[i].unoccluded());
+            for (uint32_t i = 0; i < m_strategy.infinite; ++i) {
+                FloatD target = m_samples.target(infinite[i].unoccluded());
+                if (m_lights.groups().evens())
+                    target *= m_lights.groups().evening(
+                        m_samples.infinite_group(vertex, i, active), plain(active));
+                kept.target[m_strategy.slots + i] = target;
+            }
             tau = selection_threshold<FloatD>(kept.target, m_strategy.items,
                                               m_strategy.params.shadow_rays,
                                               FloatD(vertex.effort.shadow_rays));
@@ -54,10 +62,11 @@ public:
             UInt32D ray;
             Spectrum result;
             Rng rng;
-            DRJIT_STRUCT(State, ray, result, rng)
+            GroupSums groups;
+            DRJIT_STRUCT(State, ray, result, rng, groups)
         };
         // Trace a ray to each item that is chosen; an item below tau gets what others lack
-        State state{ UInt32D(0), Spectrum(0.f), media_rng(vertex) };
+        State state{ UInt32D(0), Spectrum(0.f), media_rng(vertex), light.take() };
         UInt32D rays = dr::minimum(vertex.effort.shadow_rays, m_strategy.items);
         MaskD on     = plain(active);
         loop(
@@ -70,18 +79,22 @@ public:
                                                  (FloatD(s.ray) + offset) * tau);
                     boost  = dr::maximum(1.f, tau / chosen.target);
                 }
-                s.result +=
-                    trace(vertex, kept, infinite, chosen, s.rng, active) * Float(boost);
+                Spectrum found = trace(vertex, kept, infinite, chosen, s.rng, active);
+                s.result += found * Float(boost);
+                if (s.groups.size() > 0)
+                    light.add(s.groups, found, Float(boost),
+                              group_of(vertex, kept, chosen, active), active);
                 s.ray += 1u;
             },
             "Direct light: shadow rays");
+        light.give(std::move(state.groups));
         return state.result;
     }
 
     /// No resampling, a shadow ray for every candidate: few lights, or the method
     /// `adaptive_splitting`
     Spectrum trace_candidates(const Vertex &vertex, Counts<Float> &counts,
-                              Mask active) const {
+                              GroupLight &light, Mask active) const {
         Spectrum result(0.f);
         Rng rng = m_strategy.source == Source::AllLights
                       ? media_rng(vertex)
@@ -94,30 +107,37 @@ public:
                     result = trace_candidates(
                         vertex,
                         source.cursor(m_lights.tree(), vertex, plain(vertex.u.tree)), rng,
-                        counts, active);
+                        counts, light, active);
             });
         if (m_strategy.infinite == 0)
             return result;
         InfiniteSamples infinite = m_samples.sample_infinite(vertex, active);
-        for (size_t i = 0; i < m_strategy.infinite; ++i)
-            result += trace_sample(vertex, infinite[i], rng, active);
+        for (uint32_t i = 0; i < m_strategy.infinite; ++i) {
+            Spectrum arrives = trace_sample(vertex, infinite[i], rng, active);
+            result += arrives;
+            if (light.is_wanted())
+                light.add(arrives, m_samples.infinite_group(vertex, i, active), active);
+        }
         return result;
     }
 
 private:
     template <typename Cursor>
     Spectrum trace_candidates(const Vertex &vertex, const Cursor &cursor, Rng &rng,
-                              Counts<Float> &counts, Mask active) const {
+                              Counts<Float> &counts, GroupLight &light,
+                              Mask active) const {
         struct State {
             Cursor cursor;
             UInt32D slot;
             Spectrum result;
             Rng rng;
-            DRJIT_STRUCT(State, cursor, slot, result, rng)
-            State(const Cursor &cursor, Rng &&rng)
-                : cursor(cursor), slot(0), result(0.f), rng(std::move(rng)) {}
+            GroupSums groups;
+            DRJIT_STRUCT(State, cursor, slot, result, rng, groups)
+            State(const Cursor &cursor, Rng &&rng, GroupSums &&groups)
+                : cursor(cursor), slot(0), result(0.f), rng(std::move(rng)),
+                  groups(std::move(groups)) {}
         };
-        State state(cursor, std::move(rng));
+        State state(cursor, std::move(rng), light.take());
         MaskD on = plain(active);
         loop(
             state, [&](const State &s) { return on && s.cursor.has_next(); },
@@ -128,13 +148,40 @@ private:
                 Sample sample  = m_samples.sample(vertex, candidate.light, p, s.slot,
                                                   /* target_only = */ false, valid);
                 sample.value *= Float(dr::rcp(p));
-                s.result += trace_sample(vertex, sample, s.rng, valid);
+                Spectrum arrives = trace_sample(vertex, sample, s.rng, valid);
+                s.result += arrives;
+                if (s.groups.size() > 0)
+                    light.add(s.groups, arrives, Float(1.f),
+                              m_lights.groups().of_light(m_lights.tree(), candidate.light,
+                                                         plain(valid)),
+                              valid);
                 s.slot += 1u;
             },
             "Direct light: rays to all candidates");
         counts.add(state.slot, state.cursor.visits, active);
         rng = std::move(state.rng);
+        light.give(std::move(state.groups));
         return state.result;
+    }
+
+    /// The group of a chosen item
+    UInt32D group_of(const Vertex &vertex, const Kept &kept,
+                     const Selected<FloatD> &chosen, Mask active) const {
+        UInt32D result(0);
+        MaskD on = plain(active) && chosen.valid;
+        if (m_strategy.slots > 0) {
+            UInt32D slot = dr::minimum(chosen.item, m_strategy.slots - 1u);
+            result       = m_lights.groups().of_light(
+                m_lights.tree(), read_slot<UInt32D>(kept.light, slot, m_strategy.slots),
+                on && chosen.item < m_strategy.slots);
+        }
+        for (uint32_t i = 0; i < m_strategy.infinite; ++i) {
+            MaskD this_one = on && chosen.item == m_strategy.slots + i;
+            if (dr::any_or<true>(this_one))
+                dr::masked(result, this_one) =
+                    m_samples.infinite_group(vertex, i, Mask(this_one));
+        }
+        return result;
     }
 
     /// The chosen item's contribution, with visibility

@@ -2,6 +2,7 @@
 
 /// The state of a path, and the limits of all paths.
 
+#include "manylights/direct/group_light.h"
 #include "manylights/direct/vertex.h"
 #include <mitsuba/render/interaction.h>
 #include <mitsuba/render/medium.h>
@@ -44,9 +45,11 @@ template <typename Float, typename Spectrum> struct PathState {
     /// Did the path leave it by a direction that light sampling cannot find?
     Mask specular;
     Counts<Float> counts;
+    GroupSums<Float> groups;
     Sampler *sampler;
     DRJIT_STRUCT(PathState, active, valid, ended, depth, ray, pi, medium, throughput,
-                 result, densities, eta, from, u_tree, pdf, specular, counts, sampler)
+                 result, densities, eta, from, u_tree, pdf, specular, counts, groups,
+                 sampler)
 
     PathState(Sampler *sampler, const Ray3f &ray, const Medium *medium, Mask active)
         : active(active), valid(false), ended(false), depth(0), ray(ray), medium(medium),

@@ -28,6 +28,8 @@ public:
     using State       = PathState<Float, Spectrum>;
     using Piece       = manylights::Piece<Float, Spectrum>;
     using Direction   = manylights::Direction<Float, Spectrum>;
+    using GroupLight  = manylights::GroupLight<Float, Spectrum>;
+    using GroupSums   = typename GroupLight::Sums;
     using FloatD      = dr::detached_t<Float>;
 
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
@@ -38,13 +40,15 @@ public:
           m_flights(m_direct.media(), m_limits, m_segments),
           m_scattering(m_limits, m_segments) {}
 
-    /// Radiance along a ray from the camera, and whether it met anything
+    /// Radiance along a ray from the camera, and whether it met anything. Light of groups is
+    /// added to their sums.
     std::pair<Spectrum, Mask> trace(Sampler *sampler, const Ray3f &ray,
                                     const Medium *medium, Counts<Float> &counts,
-                                    Mask active) const {
+                                    GroupSums &groups, Mask active) const {
         if (m_limits.max_depth == 0)
             return { Spectrum(0.f), Mask(false) };
         State state{ sampler, ray, medium, active };
+        state.groups = std::move(groups);
         if (m_sees_lights)
             state.from.traits() =
                 m_direct.traits(m_segments ? Extent::Either : Extent::Point);
@@ -54,6 +58,9 @@ public:
             state, [](const State &s) { return s.active; }, [&](State &s) { step(s); },
             "Paths");
         counts = state.counts;
+        groups = std::move(state.groups);
+        for (size_t i = 0; i < groups.size() && !m_media; ++i)
+            groups[i] = dr::select(state.valid, groups[i], 0.f);
         // Light along a segment counts even if the path then leaves it unscattered
         return { m_media ? state.result : state.result & state.valid, state.valid };
     }
@@ -128,7 +135,11 @@ private:
         Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
                                                light, active && !s.specular);
         Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
-        add(s, radiance * dr::detach(weight), piece, active);
+        Spectrum arrives = radiance * dr::detach(weight);
+        add(s, arrives, piece, active);
+        GroupLight group_light = light_through(s, piece);
+        if (group_light.is_wanted())
+            group_light.add(arrives, m_direct.groups().of_hit(si), active);
         s.valid |= active && light != kNone && !s.ended;
     }
 
@@ -147,8 +158,12 @@ private:
         piece.along          = vertex.at;
         piece.u_tree         = vertex.u.tree;
         piece.along.distance = plain(piece.inside.mei.t);
+        GroupLight light(s.groups);
+        if (light.is_wanted())
+            light.set_factor(s.throughput);
         dr::masked(s.result, active) =
-            s.result + s.throughput * m_direct.sample_lights(vertex, s.counts, active);
+            s.result +
+            s.throughput * m_direct.sample_lights(vertex, s.counts, light, active);
     }
 
     void add_direct_light(State &s, const Vertex &vertex, const Piece &piece,
@@ -160,8 +175,22 @@ private:
             if (dr::any_or<true>(here))
                 lit |= here && vertex.inside->medium->use_emitter_sampling();
         }
-        if (dr::any_or<true>(lit))
-            add(s, m_direct.sample_lights(vertex, s.counts, lit), piece, lit);
+        if (dr::any_or<true>(lit)) {
+            GroupLight light = light_through(s, piece);
+            add(s, m_direct.sample_lights(vertex, s.counts, light, lit), piece, lit);
+        }
+    }
+
+    /// Adds light of the vertex at the end of a piece to the sums of groups
+    GroupLight light_through(State &s, const Piece &piece) const {
+        GroupLight light(s.groups);
+        if (light.is_wanted()) {
+            Spectrum factor = s.throughput;
+            if (m_media)
+                factor *= piece.seen;
+            light.set_factor(factor);
+        }
+        return light;
     }
 
     /// Add radiance of the vertex at the end of a piece

@@ -5,6 +5,7 @@
  * Lights are numbered as in the input, whatever order the tree gives them.
  */
 
+#include "manylights/choice/group_names.h"
 #include "manylights/choice/parameter_table.h"
 #include "manylights/choice/reservoirs.h"
 #include "manylights/choice/splitting.h"
@@ -303,6 +304,15 @@ nb::list parameters(const std::string &plugin) {
     return result;
 }
 
+/// The entry of a light with two names (how many there are, if it has none), and its group
+std::pair<size_t, std::string> light_group(const std::string &groups,
+                                           const std::string &name,
+                                           const std::string &other) {
+    GroupNames names(groups);
+    size_t entry = names.entry_of(name, other);
+    return { entry, names.groups()[names.group_of(entry)] };
+}
+
 std::vector<std::tuple<uint32_t, uint32_t, uint32_t>> learning_passes(uint32_t spp,
                                                                       uint64_t pixels) {
     if (spp == 0 || pixels == 0)
@@ -362,6 +372,9 @@ NB_MODULE(_core, m) {
              "unit square.");
     m.def("parameters", &parameters, "plugin"_a,
           "What the parameters of a plugin may be: a dictionary each.");
+    m.def(
+        "light_group", &light_group, "groups"_a, "name"_a, "other"_a = "",
+        "Which entry of light_groups a light with two names belongs to, and the group.");
     m.def("select", &select_items, "targets"_a, "picks"_a, "offset"_a,
           "Threshold-systematic selection: chosen items, and weights max(1, tau / "
           "target).");

@@ -6,6 +6,7 @@
  * rays gave. The counts can be read and written, so that parts of a job share them.
  */
 
+#include "group_levels.h"
 #include "manylights/base/host_view.h"
 #include "manylights/choice/parameters.h"
 #include "manylights/scene/scene_lights.h"
@@ -18,7 +19,7 @@ namespace manylights {
 
 template <typename Float, typename Spectrum> class LearningPasses {
 public:
-    MI_IMPORT_TYPES(Scene, Sensor)
+    MI_IMPORT_TYPES(Scene, Sensor, Film)
     using Lights = SceneLights<Float, Spectrum>;
     using Counts = mitsuba::DynamicBuffer<UInt32>;
 
@@ -73,6 +74,8 @@ public:
         m_lights  = nullptr;
         m_job     = job;
         bool anew = !plan.empty() && plan[0].starts_learning() && (job || !m_frozen);
+        if ((anew || !m_continues) && !keeps())
+            lights.set_group_levels({});
         if (!can_learn(lights)) {
             if (m_frozen)
                 refuse_counts(0);
@@ -97,9 +100,14 @@ public:
                 [&](auto &learner) { learner.count(pass.role == Role::Train); });
     }
 
-    void end_pass(const PlannedPass &pass) {
-        if (m_lights && pass.role == Role::Train)
-            m_lights->change_learner([](auto &learner) { learner.learn(); });
+    /// `first_layer`: of the groups of lights among the film's channels
+    void end_pass(const PlannedPass &pass, Film *film, size_t first_layer) {
+        if (!m_lights || pass.role != Role::Train)
+            return;
+        m_lights->change_learner([](auto &learner) { learner.learn(); });
+        if (m_lights->groups().count() > 0)
+            m_lights->set_group_levels(group_levels<Float, Spectrum>(
+                film, first_layer, m_lights->groups().count()));
     }
 
 private:
@@ -107,7 +115,10 @@ private:
         if (!m_lights)
             return;
         if (m_job || keeps())
-            m_counts = Counts(m_lights->learner().counts());
+            m_counts =
+                with_levels(m_lights->learner().counts(), m_lights->groups().levels());
+        else
+            m_lights->set_group_levels({});
         m_lights->change_learner([&](auto &learner) { learner.stop(m_job || keeps()); });
         m_lights = nullptr;
     }
@@ -118,16 +129,33 @@ private:
 
     /// Go on from what the user has written
     void write_counts() {
-        size_t size = m_lights->learner().count_size();
+        size_t rays = m_lights->learner().count_size(),
+               size = rays + m_lights->groups().count();
         if (dr::width(m_counts) != size) {
             m_lights->change_learner([](auto &learner) { learner.stop(false); });
             m_lights = nullptr;
             refuse_counts(size);
         }
+        using LearnerCounts = typename Lights::Learner::Counts;
+        HostView numbers(m_counts);
+        const uint32_t *begin = numbers.data();
+        m_lights->set_group_levels({ begin + rays, begin + size });
         m_lights->change_learner([&](auto &learner) {
-            learner.set_counts(
-                typename Lights::Learner::Counts(dr::detach<false>(m_counts)));
+            learner.set_counts(size == rays ? LearnerCounts(dr::detach<false>(m_counts))
+                                            : dr::load<LearnerCounts>(begin, rays));
         });
+    }
+
+    /// What users get to see: counts of rays, and how bright groups of lights are
+    template <typename LearnerCounts>
+    static Counts with_levels(const LearnerCounts &counts,
+                              const std::vector<uint32_t> &levels) {
+        if (levels.empty())
+            return Counts(counts);
+        HostView view(counts);
+        std::vector<uint32_t> numbers(view.data(), view.data() + view.size());
+        numbers.insert(numbers.end(), levels.begin(), levels.end());
+        return dr::load<Counts>(numbers.data(), numbers.size());
     }
 
     [[noreturn]] void refuse_counts(size_t size) const {

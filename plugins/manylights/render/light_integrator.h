@@ -5,6 +5,7 @@
  * passes between which their visibility is learnt (learning_passes.h).
  */
 
+#include "camera_sample.h"
 #include "learning_passes.h"
 #include "manylights/choice/parameters.h"
 #include "manylights/scene/light_cache.h"
@@ -20,16 +21,45 @@ template <typename Float, typename Spectrum,
 class LightIntegrator : public BaseIntegrator<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(BaseIntegrator, m_block_size, m_samples_per_pass, m_stop,
-                   m_render_timer, m_timeout, should_stop, render_sample)
-    MI_IMPORT_TYPES(Scene, Sensor, Sampler, Film, ImageBlock)
+                   m_render_timer, m_timeout, should_stop)
+    MI_IMPORT_TYPES(Scene, Sensor, Sampler, Film, ImageBlock, Medium)
     using Cache    = LightCache<Float, Spectrum>;
     using Lights   = typename Cache::Lights;
     using Pass     = manylights::Pass<Float, Spectrum>;
     using Learning = LearningPasses<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
-        : Base(props), m_params(params),
-          m_cache(params.splits_nodes(), params.bsdf_samples > 0), m_learning(m_params) {}
+        : Base(props), m_params(params), m_cache(m_params), m_learning(m_params),
+          m_first_layer(count_channels(params).size()) {}
+
+    /**
+     * As `sample`, with the weight of the ray for the layers of light groups (null: that of a
+     * sensor without a response of its own), which are the only ones that need it
+     */
+    virtual std::pair<Spectrum, Mask>
+    sample_weighted(const Scene *scene, Sampler *sampler, const RayDifferential3f &ray,
+                    const Spectrum *weight, const Medium *medium, Float *aovs,
+                    Mask active) const = 0;
+
+    std::pair<Spectrum, Mask> sample(const Scene *scene, Sampler *sampler,
+                                     const RayDifferential3f &ray, const Medium *medium,
+                                     Float *aovs, Mask active) const override {
+        return sample_weighted(scene, sampler, ray, nullptr, medium, aovs, active);
+    }
+
+    /// One of a scalar variant, in place of that of Mitsuba where layers need its weight
+    void render_sample(const Scene *scene, const Sensor *sensor, Sampler *sampler,
+                       ImageBlock *block, Float *aovs, const Vector2f &pixel,
+                       ScalarFloat scale, Mask active = true) const {
+        if (m_params.light_groups.empty())
+            return Base::render_sample(scene, sensor, sampler, block, aovs, pixel, scale,
+                                       active);
+        CameraSample<Float, Spectrum, LightIntegrator> sample(*this, scene, sensor,
+                                                              sampler);
+        Vector2f offset = sample.render(pixel, scale, aovs, active);
+        bool box        = sensor->film()->rfilter()->is_box_filter();
+        block->put(box ? pixel : pixel + offset, aovs, active);
+    }
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
                     bool evaluate) override {
@@ -59,7 +89,10 @@ public:
     }
 
     std::vector<std::string> aov_names() const override {
-        return count_channels(m_params);
+        std::vector<std::string> names = count_channels(m_params);
+        for (std::string &name : group_channels(m_params.light_groups))
+            names.push_back(std::move(name));
+        return names;
     }
 
     void traverse(mitsuba::TraversalCallback *cb) override {
@@ -83,6 +116,22 @@ public:
     }
 
 protected:
+    using Sums = GroupSums<Float>;
+
+    /// For the sums of groups of lights, before any light has arrived
+    static Sums no_light(const Lights &lights) {
+        return GroupLight<Float, Spectrum>::none_yet(lights.groups().count());
+    }
+
+    /// Into the layers of the film
+    void write_layers(const Sums &sums, const Spectrum *weight,
+                      const RayDifferential3f &ray, Float *aovs, Mask active) const {
+        if (sums.size() > 0)
+            manylights::write_layers<Float, Spectrum>(sums, weight, ray.wavelengths,
+                                                      aovs ? aovs + m_first_layer : aovs,
+                                                      active);
+    }
+
     SamplingParameters m_params;
     Cache m_cache;
 
@@ -162,7 +211,7 @@ private:
             m_learning.start_pass(plan[i]);
             Pass pass(plan[i], seed, spp, job, sampler);
             renderer.render(pass);
-            m_learning.end_pass(plan[i]);
+            m_learning.end_pass(plan[i], film, m_first_layer);
         }
         if constexpr (dr::is_jit_v<Float>)
             Log(mitsuba::Info, "Computation graph recorded and compiled. (took %s)",
@@ -212,6 +261,8 @@ private:
     mitsuba::DynamicBuffer<UInt32> m_plan_numbers;
     PassPlan m_plan;
     Learning m_learning;
+    /// Of the film's channels that are not colours, the first one with light of a group
+    size_t m_first_layer;
 };
 
 } // namespace manylights

@@ -7,6 +7,7 @@
  * machine.
  */
 
+#include "camera_sample.h"
 #include "film_sums.h"
 #include "passes.h"
 #include <mitsuba/render/integrator.h>
@@ -89,7 +90,9 @@ private:
         pixel += m_film->crop_offset(); // may be negative
         typename Sums::Samples result{ first, count, samples, {}, {} };
         std::unique_ptr<Float[]> values(new Float[m_channels]);
-        result.offset = render_sample(Vector2f(pixel), dr::rsqrt((ScalarFloat) pass.spp),
+        CameraSample<Float, Spectrum, Integrator> sample(m_integrator, m_scene, m_sensor,
+                                                         m_sampler);
+        result.offset = sample.render(Vector2f(pixel), dr::rsqrt((ScalarFloat) pass.spp),
                                       values.get(), active);
         bool differentiable = false;
         for (size_t i = 0; i < m_channels; ++i) {
@@ -152,61 +155,6 @@ private:
         else if (pass.sampler.pattern)
             seed += pixel * m_sampler->sample_count() - number * samples;
         m_sampler->seed(seed, lanes);
-    }
-
-    /// The film's channels for a sample of each lane, in the way of Mitsuba's integrators.
-    /// Returns its place within the pixel.
-    Vector2f render_sample(const Vector2f &pixel, ScalarFloat scale, Float *values,
-                           const Mask &active) const {
-        ScalarVector2f inverse = 1.f / ScalarVector2f(m_film->crop_size()),
-                       origin  = -ScalarVector2f(m_film->crop_offset()) * inverse;
-        Vector2f offset        = m_sampler->next_2d(active),
-                 position      = dr::fmadd(pixel + offset, inverse, origin);
-        Point2f aperture(.5f);
-        if (m_sensor->needs_aperture_sample())
-            aperture = m_sampler->next_2d(active);
-        Float time = m_sensor->shutter_open();
-        if (m_sensor->shutter_open_time() > 0.f)
-            time += m_sampler->next_1d(active) * m_sensor->shutter_open_time();
-        Float wavelength = 0.f;
-        if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            wavelength = m_sampler->next_1d(active);
-        auto [ray, weight] =
-            m_sensor->sample_ray_differential(time, wavelength, position, aperture);
-        if (ray.has_differentials)
-            ray.scale_differential(scale);
-
-        bool has_alpha = has_flag(m_film->flags(), mitsuba::FilmFlags::Alpha);
-        auto [spectrum, valid] =
-            m_integrator.sample(m_scene, m_sampler, ray, m_sensor->medium(),
-                                values + (has_alpha ? 5 : 4), active);
-        write(values, mitsuba::unpolarized_spectrum(weight * spectrum), ray.wavelengths,
-              valid, active);
-        return offset;
-    }
-
-    /// Into the channels of the film: special ones, or R, G, B, alpha if wanted and weight
-    void write(Float *values, const UnpolarizedSpectrum &spectrum,
-               const Wavelength &wavelengths, const Mask &valid,
-               const Mask &active) const {
-        Float alpha = dr::select(valid, Float(1.f), Float(0.f));
-        if (has_flag(m_film->flags(), mitsuba::FilmFlags::Special)) {
-            m_film->prepare_sample(spectrum, wavelengths, values, 1.f, alpha, valid);
-            return;
-        }
-        Color3f rgb;
-        if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            rgb = mitsuba::spectrum_to_srgb(spectrum, wavelengths, active);
-        else if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
-            rgb = spectrum.x();
-        else
-            rgb = spectrum;
-        for (size_t i = 0; i < 3; ++i)
-            values[i] = rgb.entry(i);
-        bool has_alpha = has_flag(m_film->flags(), mitsuba::FilmFlags::Alpha);
-        if (has_alpha)
-            values[3] = alpha;
-        values[has_alpha ? 4 : 3] = 1.f;
     }
 
     const Integrator &m_integrator;

@@ -13,6 +13,7 @@
  * program, which may change the scene between two calls, is known by belonging to Python.
  */
 
+#include "manylights/choice/parameters.h"
 #include "scene_fingerprint.h"
 #include "scene_lights.h"
 #include <atomic>
@@ -33,8 +34,7 @@ public:
     using Scene   = mitsuba::Scene<Float, Spectrum>;
     using Sampler = mitsuba::Sampler<Float, Spectrum>;
 
-    LightCache(bool keep_binary, bool finds_by_rays)
-        : m_keep_binary(keep_binary), m_finds_by_rays(finds_by_rays) {}
+    explicit LightCache(const SamplingParameters &params) : m_params(params) {}
 
 private:
     /// The lights of a scene as it was; those who use them keep it
@@ -106,9 +106,11 @@ public:
     void forget_visibility() {
         std::lock_guard<std::mutex> guard(m_mutex);
         for (const EntryPtr &entry : m_entries)
-            if (entry)
+            if (entry) {
                 entry->lights->change_learner(
                     [](auto &l) { l.stop(/* keep = */ false); });
+                entry->lights->set_group_levels({});
+            }
     }
 
     /// Expose the size of the current tree, read-only
@@ -177,7 +179,7 @@ private:
 
     /// If emitters have only become brighter or darker, and nobody uses the lights
     bool refit(Entry &entry, Fingerprint<Float> &fingerprint) const {
-        if (m_keep_binary || entry.renderings > 0 ||
+        if (m_params.splits_nodes() || entry.renderings > 0 ||
             !fingerprint.same_places(entry.fingerprint))
             return false;
         auto changed = fingerprint.changed_emission(entry.fingerprint);
@@ -202,9 +204,11 @@ private:
             if (m_entries[i] && m_entries[i]->scene == scene)
                 slot = i;
         DeviceScalars<Float> scalars(fingerprint.variables());
-        mitsuba::ref<Lights> lights = new Lights(scene, m_keep_binary);
+        mitsuba::ref<Lights> lights =
+            new Lights(scene, m_params.splits_nodes(), m_params.light_groups);
         Log(mitsuba::Info, "%s", describe(lights->statistics()));
-        if (!m_finds_by_rays)
+        // No rays that leave surfaces find lights
+        if (m_params.bsdf_samples == 0)
             lights->warn_of_lights_for_rays();
         m_entries[slot] =
             std::make_shared<Entry>(scene, std::move(fingerprint), std::move(lights));
@@ -244,9 +248,7 @@ private:
         mitsuba::ref<Lights> lights;
     };
 
-    bool m_keep_binary;
-    /// Do rays that leave surfaces find lights?
-    bool m_finds_by_rays;
+    const SamplingParameters &m_params;
     const uint64_t m_serial = next_serial();
     /// For all of the following
     mutable std::mutex m_mutex;

@@ -5,6 +5,7 @@
  * map from a hit to its light.
  */
 
+#include "light_groups.h"
 #include "media_kinds.h"
 #include "refit.h"
 #include "scene_lobes.h"
@@ -31,7 +32,7 @@ public:
         float refit_ms = 0;
     };
 
-    SceneLights(const Scene *scene, bool keep_binary) {
+    SceneLights(const Scene *scene, bool keep_binary, const GroupNames &groups) {
         // Read the emitters
         Stopwatch stopwatch;
         Table table = LightTableReader<Float, Spectrum>::read(scene);
@@ -39,6 +40,7 @@ public:
         if (!m_infinite.empty())
             m_infinite_dr = dr::load<mitsuba::DynamicBuffer<EmitterPtr>>(
                 m_infinite.data(), m_infinite.size());
+        m_groups             = LightGroups<Float, Spectrum>(scene, groups, m_infinite);
         m_proportional       = std::move(table.proportional);
         m_needs_emitter_eval = table.needs_emitter_eval;
         m_can_be_hit         = table.can_be_hit;
@@ -113,6 +115,12 @@ public:
     }
 
     const Tree &tree() const { return m_tree; }
+
+    /// Which groups they belong to, if any were asked for
+    const LightGroups<Float, Spectrum> &groups() const { return m_groups; }
+    void set_group_levels(std::vector<uint32_t> levels) {
+        m_groups.set_levels(std::move(levels));
+    }
 
     using Learner = VisibilityLearner<Float, Spectrum>;
     /// What is learnt of the lights' visibility; after a change kernels use what it says
@@ -269,6 +277,7 @@ private:
     std::vector<bool> m_proportional;
     std::vector<const Emitter *> m_infinite;
     mitsuba::DynamicBuffer<EmitterPtr> m_infinite_dr;
+    LightGroups<Float, Spectrum> m_groups;
     bool m_needs_emitter_eval = false, m_can_be_hit = false;
     /// See HostTable
     uint32_t m_only_hit = 0;

@@ -130,6 +130,18 @@ template <typename Float> struct TreeView {
         else
             return { rows.data() + light * kRowFloats };
     }
+
+    /// The emitter that a row belongs to, without the rest of it
+    UInt32 emitter(const UInt32 &light, const Mask &active) const {
+        if constexpr (dr::is_jit_v<Float>) {
+            UInt32 index = light * (uint32_t) kRowFloats + (uint32_t) kTag;
+            return dr::reinterpret_array<UInt32>(
+                       dr::gather<Float>(rows, index, active)) >>
+                   kTagEmitterShift;
+        } else {
+            return active ? row(light).emitter() : 0u;
+        }
+    }
 };
 
 /// A wide node, gathered

@@ -8,7 +8,19 @@ import sys
 
 import shtab
 
-from manylights.cli import bench, compare, convert, demo, info, merge, render, report, tree, version
+from manylights.cli import (
+    bench,
+    compare,
+    convert,
+    demo,
+    info,
+    merge,
+    mix,
+    render,
+    report,
+    tree,
+    version,
+)
 from manylights.errors import one_line
 from manylights.progress import INTERRUPTED
 
@@ -25,7 +37,7 @@ Renders scenes with very many lights. `manylights COMMAND --help` has more.
 """
 
 #: In the order of the help; each has ``add(commands, common)``.
-COMMANDS = (render, merge, info, tree, convert, demo, bench, compare, report)
+COMMANDS = (render, merge, mix, info, tree, convert, demo, bench, compare, report)
 
 
 def main(arguments: list[str] | None = None) -> int:

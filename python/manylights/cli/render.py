@@ -109,6 +109,12 @@ def add(commands, common) -> None:
         metavar="SECONDS",
         help="keep the state every so often; after an interruption the same command goes on",
     )
+    parser.add_argument(
+        "--light-groups",
+        metavar="NAME=PATTERN,...",
+        help="write the light of groups of lamps to layers, by the ids of emitters or shapes: "
+        "key=lamp_*,windows=facade (the others are the group rest); see manylights mix",
+    )
     _add_parts(parser)
     _add_workers(parser)
     shared.add_machine(parser)
@@ -180,6 +186,8 @@ def _run(options) -> None:
     settings = {name: integrators.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
         settings["hide_emitters"] = True
+    if options.light_groups is not None:
+        settings["light_groups"] = options.light_groups
     shared.start(options)
     if options.workers is None:
         if options.ship:

@@ -3,11 +3,13 @@
 - ``variants``: which of Mitsuba's variants this machine can run;
 - ``parsing``: XML or USD to Mitsuba's parsed form, and from there to objects;
 - ``integrators``: replaces Mitsuba's integrators by ours and sets parameters;
+- ``light_groups``: names of groups of lights, which are merged within a group alone;
 - ``samplers``: replaces Mitsuba's sampler by ours;
 - ``merging``: makes one mesh of many emissive ones;
 - ``load``: all of it, for the command line.
 """
 
+from manylights.loading import light_groups
 from manylights.loading.load import LoadedScene, as_loaded, load
 from manylights.loading.parsing import (
     ParsedScene,
@@ -28,6 +30,7 @@ __all__ = [
     "files_of",
     "has_backend",
     "instantiate",
+    "light_groups",
     "load",
     "parse",
     "search_beside",

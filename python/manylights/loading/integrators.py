@@ -13,6 +13,7 @@ from typing import Any
 import mitsuba as mi
 
 from manylights.errors import UsageError
+from manylights.loading import light_groups
 from manylights.output import channels
 
 #: Our plugins: direct light on surfaces, and paths through surfaces and media.
@@ -40,7 +41,7 @@ class Parameter:
 
     def __str__(self) -> str:
         remark = f", {self.remark}" if self.remark else ""
-        return f"{self.allowed}, default {value_text(self.default)}{remark}"
+        return f"{self.allowed}, default {value_text(self.default) or 'none'}{remark}"
 
 
 BOOLEAN = "true or false"
@@ -55,6 +56,7 @@ SAMPLING_PARAMETERS = {
     "split_function": Parameter("near or far", "near", "for method=talk only"),
     "learn_visibility": Parameter("true, false or keep", True, f"for method={METHODS[0]} only"),
     "counts": Parameter(BOOLEAN, False, f"adds channels {', '.join(channels.COUNTS)}"),
+    "light_groups": Parameter("text", "", "layers with their light, as key=lamp_*,windows=facade"),
 }
 
 #: What each plugin accepts.
@@ -295,6 +297,8 @@ def _apply(props, settings: dict[str, Any]) -> None:
         if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
             known = "; ".join(f"{key} ({what})" for key, what in PARAMETERS[plugin].items())
             raise UsageError(f"--set {name}: {plugin} has no such parameter. It has: {known}")
+        if name == light_groups.PARAMETER and plugin not in PARAMETERS:
+            raise UsageError(f"light groups: {plugin} has none, {' and '.join(PARAMETERS)} have")
         props[name] = value
 
 

@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from manylights.loading import light_groups
 from manylights.loading.integrators import PARAMETERS, leaf_integrators
 
 #: Parameters of shapes that say what the mesh is. Shapes with any other stay as they are.
@@ -45,7 +46,7 @@ class MergedScene(dict):
     """A dictionary for ``mi.load_dict``.
 
     Attributes:
-        merged: the ids of the shapes in each merged mesh, by the id of that mesh.
+        merged: the ids of the shapes in each merged mesh, by the name of that mesh.
     """
 
     merged: dict[str, list[str]]
@@ -60,6 +61,7 @@ class Lamp:
         id: what users call it.
         mesh: the shape, or the properties to make it of, without BSDF and emitter.
         radiance: three channels.
+        names: those that light groups may know it by: of the emitter, and of the shape.
         materials: BSDF, media and textures by the names that a mesh expects.
         uses: indices of the nodes that became ``materials``.
     """
@@ -70,6 +72,7 @@ class Lamp:
     radiance: np.ndarray
     materials: dict[str, object]
     uses: set[int]
+    names: tuple[str, str]
 
     def kind(self) -> tuple:
         """Return what lamps of one mesh have in common.
@@ -96,7 +99,8 @@ def merge_emitters(scene: dict, keep=()) -> MergedScene:
     ``area`` emitter of constant radiance, and have the same BSDF, media and flags. Equal BSDFs are
     the same. All others stay as they are: textured ones, and those that another part of the
     scene refers to, or to a part of which. In spectral variants all stay, since an attribute has
-    another spectrum there than a light.
+    another spectrum there than a light. Where the integrator has light groups, a mesh has lamps of
+    one of their entries, and the key and the ids of the first lamp.
 
     The image is the same, up to noise. ``mi.traverse`` shows the mesh, not its lamps. The result
     has objects of the current variant; ``scene`` is not changed.
@@ -236,6 +240,13 @@ class _Merging:
         self.config.parallel = False
         self.state, self.objects = state, {}
         self.groups, self.meshes, self.used = {}, {}, set()
+        nodes = leaf_integrators(state)
+        asked = {node.props.get(light_groups.PARAMETER, "") for node in nodes}
+        objects = [
+            value for _, value in state.root.props.items() if isinstance(value, mi.Integrator)
+        ]
+        asked |= {light_groups.of_integrator(each) for each in objects}
+        self.light_groups = sorted(asked - {""})
         if "spectral" in mi.variant():
             return
         items = [item for item in state.root.props.items() if item[0] not in keep]
@@ -244,15 +255,24 @@ class _Merging:
         # A file is not read for nothing if its lamp is the only one
         lamps = [lamp for group in _groups(lamps, Lamp.look) for lamp in group]
         lamps = [lamp for lamp in lamps if _try(self._load, lamp)]
-        for group in _groups(lamps, Lamp.kind):
+        for group in _groups(lamps, lambda lamp: (lamp.kind(), self._light_groups(lamp))):
             self._merge(group)
 
+    def _light_groups(self, lamp: Lamp) -> tuple:
+        """Return which entry of the light groups of each integrator a lamp belongs to."""
+        return tuple(light_groups.entry_of(text, *lamp.names) for text in self.light_groups)
+
     def _merge(self, lamps: list[Lamp]) -> None:
-        name = f"merged_{len(lamps)}_emitters"
+        key = name = f"merged_{len(lamps)}_emitters"
         while name in self.groups or name in self.state.root.props:
-            name += "_more"
-        self.groups[name] = lamps
-        self.meshes[name] = _join(name, lamps)
+            key = name = f"{name}_more"
+        if self.light_groups:
+            key, name = lamps[0].key, lamps[0].id
+        mesh = _join(name, lamps)
+        if self.light_groups:
+            # By these it belongs to the groups of its lamps.
+            mesh.set_id(lamps[0].names[1])
+        self.groups[name], self.meshes[key] = lamps, mesh
         for lamp in lamps:
             self._use(lamp.uses)
         mi.Log(mi.LogLevel.Info, f"{name}: {', '.join(lamp.id for lamp in lamps)}")
@@ -290,7 +310,8 @@ class _Merging:
                 return None
         if radiance is None:
             return None
-        return Lamp(key, props.id() or key, geometry, radiance, materials, uses)
+        names = (self._id(emitters[0]), props.id())
+        return Lamp(key, props.id() or key, geometry, radiance, materials, uses, names)
 
     def _load(self, lamp: Lamp) -> bool:
         """Make the mesh of a lamp; return whether all that it has can be merged."""
@@ -310,13 +331,20 @@ class _Merging:
         materials = {"interior": mesh.interior_medium(), "exterior": mesh.exterior_medium()}
         materials["bsdf"] = None if _is_black(mesh.bsdf()) else mesh.bsdf()
         materials = {name: part for name, part in materials.items() if part is not None}
-        return Lamp(key, key, mesh, radiance, materials, set())
+        # An object is called by its key.
+        return Lamp(key, key, mesh, radiance, materials, set(), (emitter.id(), key))
 
     def _is(self, value, kind: str) -> bool:
         """Is this part of a shape, a node or an object, an "Emitter", a "BSDF" or a "Medium"?"""
         if isinstance(value, Reference):
             return self.state.nodes[value.index()].type == getattr(mi.ObjectType, kind)
         return isinstance(value, getattr(mi, kind))
+
+    def _id(self, value) -> str:
+        """Return the id of a node or an object."""
+        if isinstance(value, Reference):
+            return self.state.nodes[value.index()].props.id()
+        return value.id()
 
     def _radiance(self, value) -> np.ndarray | None:
         """Return the three channels that an emitter emits everywhere, None if it varies."""
@@ -419,6 +447,7 @@ def _join(name: str, lamps: list[Lamp]):
             parameters[part] = _all(lamps, part)
     parameters.update()
     mesh.set_id(name)
+    mesh.emitter().set_id(lamps[0].names[0])
     return mesh
 
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from manylights import files
-from manylights.output import channels, exr
+from manylights.output import channels, exr, light_groups
 from manylights.threads import threads_for_files
 
 
@@ -41,16 +41,21 @@ def write_images(
         target: the EXR file.
         layers: further channels by name, shape (height, width) each. Default: none.
         attributes: of the EXR file (``exr.write``). Default: none.
-        number: of the image's channels in the file (``number_of``).
+        number: of the image's channels in the file (``number_of``); single precision where there
+            are layers of light groups.
 
     Returns:
         The written files, and lines for the log about what could not be written as it is.
     """
     exact = np.array(bitmap)
     exact = exact.reshape(*exact.shape[:2], -1)
+    names = channels.names(bitmap)
+    # Layers of light groups add up to the bit.
+    number = np.float32 if light_groups.groups(names) else number
     with np.errstate(over="ignore"):
         pixels = exact.astype(number)
-    planes = {name: pixels[..., index] for index, name in enumerate(channels.names(bitmap))}
+    planes = {name: pixels[..., index] for index, name in enumerate(names)}
+    planes |= light_groups.alphas(planes)
     own = {name: text for name, text in bitmap.metadata().items() if name.startswith(exr.OURS)}
     own |= attributes or {}
     written = [exr.write(target, {**planes, **(layers or {})}, own)]
@@ -83,14 +88,19 @@ def _overflows(exact: np.ndarray, written: np.ndarray) -> list[str]:
 
 
 def exposed(bitmap, factor: float):
-    """Return a bitmap with the colour channels (R, G, B, Y) multiplied by ``factor``."""
-    if factor == 1.0:
-        return bitmap
+    """Return a bitmap with the colour channels (R, G, B, Y) multiplied by ``factor``.
+
+    Those of layers of light groups are, too, and the image is the sum of these.
+    """
     names = channels.names(bitmap)
+    layers = light_groups.all_channels(names)
+    if factor == 1.0 and not layers:
+        return bitmap
     pixels = np.array(bitmap, dtype=np.float32).reshape(*np.array(bitmap).shape[:2], -1)
     for index, name in enumerate(names):
-        if name in (*channels.RGB, "Y"):
+        if name in (*channels.RGB, "Y", *layers):
             pixels[..., index] *= factor
+    light_groups.add_up(pixels, names)
     return channels.join(names, pixels)
 
 

@@ -9,11 +9,13 @@
 - ``parts``: which steps each of several machines has;
 - ``state_file``, ``checkpoint``: the state in a file, and when it is written;
 - ``workers``: the same steps by several processes and machines;
-- ``render``: puts these together, and ``merge`` what several have rendered.
+- ``render``: puts these together, and ``merge`` what several have rendered;
+- ``mix``: other images of one with layers of light groups.
 """
 
 from manylights.rendering.job import Job
 from manylights.rendering.merge import Merged, merge
+from manylights.rendering.mix import Mixed, mix
 from manylights.rendering.render import Progress, RenderResult, render
 
-__all__ = ["Job", "Merged", "Progress", "RenderResult", "merge", "render"]
+__all__ = ["Job", "Merged", "Mixed", "Progress", "RenderResult", "merge", "mix", "render"]

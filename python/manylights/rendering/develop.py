@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from manylights.output import channels, images
+from manylights.output import channels, images, light_groups
 from manylights.rendering.noise import noise, variance_of_mean
 from manylights.rendering.sums import Sums
 
@@ -75,13 +75,15 @@ def develop(film, raw: np.ndarray, exposure: float = 1.0):
     """Return the film's image of these sums: an array and an ``mi.Bitmap``, weights divided out.
 
     The film holds the sums then: it is what was rendered last. Colours are multiplied by
-    ``exposure``.
+    ``exposure``. An image with layers of light groups is their sum.
     """
     film.clear()
     film.put_block(mi.ImageBlock(mi.TensorXf(raw), film.crop_offset()))
     bitmap = images.exposed(film.bitmap(), exposure)
-    image = np.array(film.develop())
+    image, names = np.array(film.develop()), channels.names(bitmap)
     if exposure != 1.0:
-        chosen = colors(channels.names(bitmap))
+        layers = light_groups.all_channels(names)
+        chosen = [*colors(names), *(names.index(name) for name in layers)]
         image[..., chosen] *= np.float32(exposure)
+    light_groups.add_up(image, names)
     return image, bitmap

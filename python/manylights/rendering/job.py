@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.errors import UsageError
-from manylights.loading import LoadedScene
+from manylights.loading import LoadedScene, light_groups
 from manylights.output import images
 from manylights.rendering import plan as plans
 from manylights.rendering.driver import ENTRIES, Driver
@@ -88,6 +89,7 @@ class Job:
         for name, value in (("until_noise", noise), ("seconds", seconds)):
             check(name, value, value is None or 0.0 < value < np.inf, "a number above 0")
         driver = Driver(loaded, sensors[sensor], integrator)
+        _check_groups(driver)
         part = Part.of(part)
         if part is not None:
             _check_part(part, driver, noise, seconds)
@@ -135,6 +137,7 @@ class Job:
         from manylights import __version__
 
         width, height = map(int, self.film.crop_size())
+        groups = light_groups.of_integrator(self.driver.integrator)
         return {
             "version": f"manylights {__version__}, Mitsuba {mi.__version__}",
             "format": FORMAT,
@@ -154,6 +157,7 @@ class Job:
             "adjoint": self.driver.adjoint,
             "exposure": self.loaded.exposure,
             **self.loaded.choices,
+            **({"light_groups": groups} if groups else {}),
             "files": _digests(self.loaded.files) or {"scene": _digest(self.loaded.scene)},
         }
 
@@ -188,6 +192,18 @@ def _check_part(part: Part, driver: Driver, noise, seconds) -> None:
     film = driver.sensor.film().class_name()
     if film not in FILMS:
         raise UsageError(f"{part.words()}: parts of a {film} cannot be merged, only of an hdrfilm")
+
+
+def _check_groups(driver: Driver) -> None:
+    """Raise ``UsageError`` if light groups are asked for and the film has no colours."""
+    film = driver.sensor.film()
+    known = re.search(r"pixel_format = (\w+)", str(film))
+    plain = film.class_name() in FILMS and known and known[1] in ("rgb", "rgba")
+    if light_groups.of_integrator(driver.integrator) and not plain:
+        what = f"has pixel_format {known[1]}" if known else f"is a {film.class_name()}"
+        raise UsageError(
+            f"light groups: the film {what}, layers need an hdrfilm with pixel_format rgb or rgba"
+        )
 
 
 def check(name: str, value, allowed: bool, what: str) -> None:

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.errors import UsageError
-from manylights.output import channels, images
+from manylights.output import channels, images, light_groups
 from manylights.rendering import metadata, state_file
 from manylights.rendering.develop import WEIGHT, develop
 from manylights.rendering.job import FILMS, STATE, differences
@@ -239,7 +239,9 @@ def _merge_images(first: Saved, bitmap, paths: list[Path], target: Path | None) 
         total = total + np.array(bitmap, np.float64) * weight
         samples += weight
     pixels = (total / samples).astype(np.float32)
-    bitmap = channels.join(names, pixels.reshape(*pixels.shape[:2], len(names)))
+    pixels = pixels.reshape(*pixels.shape[:2], len(names))
+    light_groups.add_up(pixels, names)
+    bitmap = channels.join(names, pixels)
     text = f"images: the mean of {count}, weighted by samples; their sums are not in the files"
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:

@@ -94,6 +94,7 @@ def render(
     threads: int | None = None,
     client=None,
     ship: bool = False,
+    light_groups: str | dict[str, str | list[str]] | None = None,
 ) -> RenderResult:
     """Render a scene: a number of samples, or until an image is good enough or a time is up.
 
@@ -123,13 +124,19 @@ def render(
         threads: CPU threads, 1 or more. Default: all, on workers those that Dask knows of.
         client: ``distributed.Client``, whose workers render the scene of a file. Default: none.
         ship: send them the files? Default: the workers have these at the same path.
+        light_groups: groups of lights by patterns of ids, as ``"key=lamp_*,windows=facade"`` or
+            ``{"key": "lamp_*", "windows": ["facade", "pane_?"]}``: the image gets layers
+            ``RGBA_key.R``, ... with their light, and is the sum of them, bit for bit
+            (``output.light_groups``). All other lights are the group ``rest``. For a scene that is
+            read here, not for objects of Mitsuba. Default: what the integrator says.
 
     Raises:
         UsageError: (a ``ValueError``) impossible values, files of another render, no worker of use.
         RuntimeError: Mitsuba or a worker cannot read or render the scene.
     """
     target = None if output is None else images.check_output(str(output))
-    loaded, own = loading.as_loaded(scene, integrator)
+    groups = None if light_groups is None else loading.light_groups.as_text(light_groups)
+    loaded, own = loading.as_loaded(scene, integrator, groups)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
