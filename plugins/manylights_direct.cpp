@@ -69,6 +69,14 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
      should arrive by what is known of their visibility, all of it where nothing is known, 0
      where shadow rays are traced to all lights. (Default: no, i.e. |false|)
 
+ * - aovs
+   - |string|
+   - Film channels that describe what camera rays meet first: pairs :code:`NAME:TYPE` between commas,
+     with the types and channels of Mitsuba's :monosp:`aov`: :code:`albedo`, :code:`depth`,
+     :code:`position`, :code:`uv`, :code:`geo_normal`, :code:`sh_normal`, :code:`dp_du`,
+     :code:`dp_dv`, :code:`duv_dx`, :code:`duv_dy`, :code:`prim_index` and :code:`shape_index`,
+     see below. (Default: none)
+
  * - plan, visibility.counts
    - |int| array
    - Passes of a job and what it has learnt, see below.
@@ -136,6 +144,15 @@ considered anyway, and while differentiating; an integrator that is nested in ot
 it for samples uses what it has kept, and learns nothing. What was kept is dropped with the
 integrator: load another one to start anew.
 
+**Surfaces in sight.** The channels of :code:`aovs` come from the same camera rays as the image,
+which is the same with and without them, and are weighted by the same filter; with
+:code:`hide_emitters` they do not show emitters either. Where nothing is met they are 0.
+:code:`albedo` is for denoisers: that of the first surface that scatters light widely, seen through
+mirrors, glass and holes, times what these leave of it, and on surfaces without a diffuse lobe all
+that they reflect. :code:`shape_index` counts the shapes in their order in the scene from 1, in all
+variants, and shows of instances the instance. Indices are averaged like all else where a pixel
+has several. Films with bands of their own (:monosp:`specfilm`) take no further channels.
+
 **Parts of a job.** A rendering that is not made by one call follows a plan, the entry
 :code:`plan` of :code:`mi.traverse(integrator)`: four numbers for each pass, its first sample, the
 number of samples of each pixel, its role (0: all pixels; 1: those that train; 2: the others) and a
@@ -192,11 +209,13 @@ public:
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         auto lights = m_cache.get(scene, sampler);
         DirectLight direct(scene, *lights, m_params);
-        return manylights::differentiable<Float>(
-            sampler, (*lights).evaluates_loops(), [&] {
+        auto result =
+            manylights::differentiable<Float>(sampler, (*lights).evaluates_loops(), [&] {
                 return manylights::call_flat<Float>(
                     [&] { return radiance(scene, direct, sampler, ray, aovs, active); });
             });
+        Base::write_aovs(scene, ray, aovs, m_hide_emitters, active);
+        return result;
     }
 
     /// Radiance along a ray, and whether it met anything
@@ -240,7 +259,7 @@ public:
     std::string to_string() const override {
         std::ostringstream oss;
         oss << "ManyLightsDirect[" << std::endl
-            << "  " << string::indent(manylights::to_string(m_params)) << "," << std::endl
+            << "  " << string::indent(Base::describe_parameters()) << "," << std::endl
             << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << ","
             << std::endl
             << "  tree = " << string::indent(m_cache.to_string()) << std::endl

@@ -5,8 +5,9 @@
  * passes between which their visibility is learnt (learning_passes.h).
  */
 
+#include "film_channels.h"
+#include "first_hit.h"
 #include "learning_passes.h"
-#include "manylights/choice/parameters.h"
 #include "manylights/scene/light_cache.h"
 #include "ordered_blocks.h"
 #include "wavefronts.h"
@@ -28,7 +29,7 @@ public:
     using Learning = LearningPasses<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
-        : Base(props), m_params(params),
+        : Base(props), m_params(params), m_aovs(read_aovs(props)),
           m_cache(params.splits_nodes(), params.bsdf_samples > 0), m_learning(m_params) {}
 
     TensorXf render(Scene *scene, Sensor *sensor, UInt32 seed, uint32_t spp, bool develop,
@@ -37,6 +38,7 @@ public:
         dr::scoped_flush_denormals flush(true);
         auto lock = lock_rendering();
         typename Cache::Rendering guard(m_cache, scene);
+        prepare_channels(scene, sensor->film());
         if (m_rendering || m_differentiating || m_samples_per_pass != kOnePass ||
             has_entry_for_each_sample(sensor))
             return Base::render(scene, sensor, seed, spp, develop, evaluate);
@@ -59,8 +61,11 @@ public:
     }
 
     std::vector<std::string> aov_names() const override {
-        return count_channels(m_params);
+        return FilmChannels(m_params, m_aovs).names;
     }
+
+    /// How many of these describe surfaces: what else is computed does not depend on them
+    size_t aov_count() const { return FilmChannels(m_params, m_aovs).aov_count(); }
 
     void traverse(mitsuba::TraversalCallback *cb) override {
         Base::traverse(cb);
@@ -83,7 +88,23 @@ public:
     }
 
 protected:
+    /// Write the channels of the surfaces in sight; null: the caller has none
+    void write_aovs(const Scene *scene, const RayDifferential3f &ray, Float *channels,
+                    bool hide_emitters, Mask active) const {
+        if (m_aovs.empty() || !channels)
+            return;
+        FirstHit<Float, Spectrum>(scene, m_shape_numbers, hide_emitters)
+            .write(m_aovs, ray, channels + count_channels(m_params).size(), active);
+    }
+
+    /// "name = value" lines of what has an effect
+    std::string describe_parameters() const {
+        std::string aovs = m_aovs.empty() ? "" : ",\naovs = " + to_string(m_aovs);
+        return manylights::to_string(m_params) + aovs;
+    }
+
     SamplingParameters m_params;
+    std::vector<Aov> m_aovs;
     Cache m_cache;
 
 private:
@@ -91,6 +112,17 @@ private:
                                         Wavefronts<Float, Spectrum, LightIntegrator>,
                                         OrderedBlocks<Float, Spectrum, LightIntegrator>>;
     static constexpr uint32_t kOnePass = (uint32_t) -1; // Mitsuba's default
+
+    void prepare_channels(const Scene *scene, const Film *film) const {
+        if (has_flag(film->flags(), mitsuba::FilmFlags::Special) && !aov_names().empty())
+            throw std::runtime_error(
+                "The film \"" + std::string(film->class_name()) +
+                "\" has bands of its own and takes no further channels: give \"counts\" "
+                "and \"aovs\" to an integrator with an \"hdrfilm\".");
+        for (const Aov &aov : m_aovs)
+            if (aov.type == AovType::ShapeIndex)
+                m_shape_numbers.prepare(scene);
+    }
 
     /// One integrator has one rendering at a time: others that overlap wait for it
     std::unique_lock<std::recursive_mutex> lock_rendering() {
@@ -212,6 +244,7 @@ private:
     mitsuba::DynamicBuffer<UInt32> m_plan_numbers;
     PassPlan m_plan;
     Learning m_learning;
+    ShapeNumbers<Float, Spectrum> m_shape_numbers;
 };
 
 } // namespace manylights

@@ -10,7 +10,7 @@ from manylights import loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
 from manylights.loading import integrators
-from manylights.output import images
+from manylights.output import channels, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
 from manylights.rendering import Progress, RenderResult, render
 from manylights.rendering.checkpoint import path_for
@@ -95,9 +95,19 @@ def add(commands, common) -> None:
         metavar="SECONDS",
         help="keep the state every so often; after an interruption the same command goes on",
     )
+    _add_layers(parser)
     _add_parts(parser)
     shared.add_machine(parser)
     parser.set_defaults(command=_run)
+
+
+def _add_layers(parser) -> None:
+    parser.add_argument(
+        "--aov",
+        metavar="NAMES",
+        help="layers that describe the surfaces in sight, with commas between: "
+        + ", ".join(channels.AOVS),
+    )
 
 
 def _add_parts(parser) -> None:
@@ -146,6 +156,8 @@ def _run(options) -> None:
     settings = {name: integrators.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
         settings["hide_emitters"] = True
+    if options.aov is not None:
+        settings["aovs"] = channels.aov_list(options.aov, "--aov")
     shared.start(options)
     stage = shared.usd_options(options)
     with waiting("loading"):

@@ -167,8 +167,9 @@ class _Parts:
             previews, notes = images.write_preview(bitmap, target)
             merged.files = [state_file.write(saved), *previews]
         else:
-            _sign(bitmap, self.facts, [self.facts["seed"]], samples)
-            merged.files, notes = images.write_images(bitmap, target, number=_number(self.facts))
+            own = _signature(self.facts, [self.facts["seed"]], samples)
+            number = _number(self.facts)
+            merged.files, notes = images.write_images(bitmap, target, {}, own, number, samples)
         merged.notes += notes
         return merged
 
@@ -211,10 +212,10 @@ def _developed(saved: Saved, state: State):
     return develop(film, state.total(facts["adjoint"]), facts["exposure"])[1]
 
 
-def _sign(bitmap, facts: dict, seeds: list[int], samples: int) -> None:
-    """Write to an image what a finished render says of itself."""
+def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
+    """Return what a finished render says of itself."""
     own = {name: facts[name] for name in facts if name not in STATE}
-    state_file.sign(bitmap, {**own, "part": "1/1", "seeds": seeds}, samples)
+    return state_file.signature({**own, "part": "1/1", "seeds": seeds}, samples)
 
 
 def _number(facts: dict) -> type:
@@ -222,27 +223,37 @@ def _number(facts: dict) -> type:
     return np.float16 if facts["number"] == "float16" else np.float32
 
 
-def _merge_images(first: Saved, bitmap, paths: list[Path], target: Path | None) -> Merged:
+def _merge_images(first: Saved, planes: dict, paths: list[Path], target: Path | None) -> Merged:
     """Return the mean of finished images."""
-    facts, seeds = first.facts, list(first.facts["seeds"])
-    names, total = channels.names(bitmap), 0.0
-    samples, count = 0, 1 + len(paths)
-    owners = dict.fromkeys(seeds, first.path)
-    saved = first
+    facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
+    names = [name for name in planes if channels.is_averaged(name)]
+    total = {name: np.zeros(plane.shape) for name, plane in planes.items() if name in names}
+    samples, saved = 0, first
     for path in [None, *paths]:
         if path is not None:
-            saved, bitmap = state_file.read(path, WHAT, "")
-            _check_image(saved, channels.names(bitmap), first, names, owners)
+            saved, planes = state_file.read(path, WHAT, "")
+            found = [name for name in planes if channels.is_averaged(name)]
+            _check_image(saved, found, first, names, owners)
         weight = saved.facts["samples_done"]
-        total = total + np.array(bitmap, np.float64) * weight
+        for name in names:
+            # The variance of a mean: weights are squared
+            power = 2 if name.startswith(channels.VARIANCE) else 1
+            total[name] += planes[name].astype(np.float64) * float(weight) ** power
         samples += weight
-    pixels = (total / samples).astype(np.float32)
-    bitmap = channels.join(names, pixels.reshape(*pixels.shape[:2], len(names)))
+    means = {
+        name: total[name] / float(samples) ** (2 if name.startswith(channels.VARIANCE) else 1)
+        for name in names
+    }
+    shown = channels.shown(names)
+    layers = {name: means[name].astype(np.float32) for name in names if name not in shown}
+    bitmap = channels.join(shown, np.stack([means[name] for name in shown], axis=-1))
+    count = 1 + len(paths)
     text = f"images: the mean of {count}, weighted by samples; their sums are not in the files"
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
-        _sign(bitmap, facts, sorted(owners), samples)
-        merged.files, notes = images.write_images(bitmap, target, number=_number(facts))
+        own = _signature(facts, sorted(owners), samples)
+        number = _number(facts)
+        merged.files, notes = images.write_images(bitmap, target, layers, own, number, samples)
         merged.notes += notes
     return merged
 

@@ -7,7 +7,7 @@ from four independent images that are rendered in turn.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,6 +88,7 @@ def render(
     checkpoint_seconds: float = 60.0,
     part: tuple[int, int] | Part | None = None,
     learnt: str | Path | None = None,
+    aovs: str | Sequence[str] | None = None,
     progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
 ) -> RenderResult:
@@ -116,6 +117,10 @@ def render(
         part: ``(3, 16)`` renders the third of 16 shares of the steps, with ``output="a.exr"`` to
             ``a.part-03-of-16.exr``, for ``manylights.merge``. Default: all, without parts.
         learnt: file of another part, to take over what is learnt. Default: learn it anew.
+        aovs: channels that describe the surfaces in sight, "albedo,normal,depth" or a list:
+            ``albedo``, ``normal``, ``geo_normal``, ``position``, ``depth``, ``uv``,
+            ``shape_index``, ``prim_index``, ``dp_du``, ``dp_dv``, ``duv_dx``, ``duv_dy``. For
+            scenes that are not loaded yet. Default: none.
         progress: called before the first step and after each, in scalar variants also in between
             and from other threads. What it raises ends the render.
         threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
@@ -127,7 +132,8 @@ def render(
     """
     check("threads", threads, threads is None or threads >= 1, "1 or more")
     target = None if output is None else images.check_output(str(output))
-    loaded, own = loading.as_loaded(scene, integrator)
+    added = {} if aovs is None else {"aovs": channels.aov_list(aovs)}
+    loaded, own = loading.as_loaded(scene, integrator, added)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
@@ -159,11 +165,18 @@ def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -
         Checkpoint(path, job, facts=facts).write(state)
         result.files = [path]
     elif target is not None:
-        state_file.sign(result.bitmap, {**facts, "seeds": [job.seed]}, result.samples)
-        layers = variance_layers(result)
-        attributes = metadata.attributes(job, result, facts["version"])
+        signed = state_file.signature({**facts, "seeds": [job.seed]}, result.samples)
+        layers = {**variance_layers(result)}
+        attributes = signed | metadata.attributes(job, result, facts["version"])
         number = images.number_of(job.film)
-        result.files, notes = images.write_images(result.bitmap, target, layers, attributes, number)
+        result.files, notes = images.write_images(
+            result.bitmap,
+            target,
+            layers,
+            attributes,
+            number,
+            result.samples,
+        )
         result.notes += notes
     if store is not None and store.path not in result.files:
         store.remove()
@@ -172,11 +185,7 @@ def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -
 
 def variance_layers(result: RenderResult) -> dict[str, np.ndarray]:
     """Return the channels ``variance.*``, where the variance is known."""
-    if result.variance is None:
-        return {}
-    names = channels.RGB if result.variance.shape[2] == 3 else ("Y",)
-    planes = np.moveaxis(result.variance, 2, 0).astype(np.float32)
-    return {f"variance.{name}": plane for name, plane in zip(names, planes)}
+    return channels.color_layers(channels.VARIANCE, result.variance)
 
 
 def _store(path: str | Path, job: Job, seconds: float) -> Checkpoint:
