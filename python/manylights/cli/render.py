@@ -10,9 +10,9 @@ from manylights import loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
 from manylights.loading import integrators
-from manylights.output import channels, images
+from manylights.output import channels, denoise, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
-from manylights.rendering import Progress, RenderResult, render
+from manylights.rendering import Progress, RenderResult, live, render
 from manylights.rendering.checkpoint import path_for
 from manylights.rendering.parts import Part
 from manylights.rendering.render import part_path
@@ -108,6 +108,27 @@ def _add_layers(parser) -> None:
         help="layers that describe the surfaces in sight, with commas between: "
         + ", ".join(channels.AOVS),
     )
+    parser.add_argument(
+        "--denoise",
+        action="store_true",
+        help="add layers denoised.* by Open Image Denoise and show them in the PNG; implies "
+        "--aov albedo,normal (needs manylights[denoise])",
+    )
+    parser.add_argument(
+        "--exposure",
+        type=shared.stops,
+        default=0.0,
+        metavar="EV",
+        help="stops by which the PNG is brighter (default: 0)",
+    )
+    parser.add_argument(
+        "--tev",
+        nargs="?",
+        const="",
+        metavar="HOST:PORT",
+        help=f"show the picture after each step in tev (default: {live.HOST}:{live.PORT}; needs "
+        "manylights[tev])",
+    )
 
 
 def _add_parts(parser) -> None:
@@ -156,8 +177,13 @@ def _run(options) -> None:
     settings = {name: integrators.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
         settings["hide_emitters"] = True
-    if options.aov is not None:
-        settings["aovs"] = channels.aov_list(options.aov, "--aov")
+    if options.denoise:
+        denoise.check_installed()
+    aovs = denoise.with_guides(options.aov) if options.denoise else options.aov
+    if aovs is not None:
+        settings["aovs"] = channels.aov_list(aovs, "--aov")
+        if options.aov is None:
+            settings["aovs"] = integrators.Wish(settings["aovs"])
     shared.start(options)
     stage = shared.usd_options(options)
     with waiting("loading"):
@@ -170,6 +196,7 @@ def _run(options) -> None:
     if not 0 <= options.sensor < count:
         raise UsageError(f"--sensor {options.sensor}: the scene has {count}, counted from 0")
     names = ("spp", "seed", "sensor", "until_noise", "seconds", "threads")
+    names += ("denoise", "exposure", "tev")
     wanted = {name: getattr(options, name) for name in names}
     wanted |= {"part": _part(options), "learnt": options.learnt}
     if options.checkpoint is not None:

@@ -16,9 +16,11 @@ import numpy as np
 
 from manylights import loading
 from manylights.errors import UsageError
+from manylights.loading.integrators import Wish
 from manylights.output import channels, images
+from manylights.output import denoise as denoising
 from manylights.rendering import checkpoint as checkpoints
-from manylights.rendering import metadata, state_file
+from manylights.rendering import live, metadata, state_file
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
 from manylights.rendering.job import Job, check
@@ -62,6 +64,8 @@ class RenderResult:
         seconds: of rendering, those of interrupted processes, too.
         notes: lines about what was replaced, left out or not reached.
         files: that were written.
+        denoised: the colours without noise, shape (height, width, 3 or 1); None if that was not
+            asked for.
     """
 
     image: np.ndarray
@@ -72,6 +76,7 @@ class RenderResult:
     seconds: float
     notes: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    denoised: np.ndarray | None = None
 
 
 def render(
@@ -89,6 +94,9 @@ def render(
     part: tuple[int, int] | Part | None = None,
     learnt: str | Path | None = None,
     aovs: str | Sequence[str] | None = None,
+    denoise: bool = False,
+    exposure: float = 0.0,
+    tev: str | None = None,
     progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
 ) -> RenderResult:
@@ -121,6 +129,12 @@ def render(
             ``albedo``, ``normal``, ``geo_normal``, ``position``, ``depth``, ``uv``,
             ``shape_index``, ``prim_index``, ``dp_du``, ``dp_dv``, ``duv_dx``, ``duv_dy``. For
             scenes that are not loaded yet. Default: none.
+        denoise: find the image without noise, too, by Open Image Denoise (mitsuba-oidn), from
+            ``albedo`` and ``normal`` where the scene is not loaded yet and the integrator is ours.
+            The file has it in ``denoised.*``, the PNG shows it, the image stays as it is.
+        exposure: stops by which the PNG is brighter, from -64 to 64.
+        tev: ``HOST:PORT`` (empty: this machine) of the viewer tev, which gets the picture after
+            each step, by the package tevclient. Default: none.
         progress: called before the first step and after each, in scalar variants also in between
             and from other threads. What it raises ends the render.
         threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
@@ -132,14 +146,41 @@ def render(
     """
     check("threads", threads, threads is None or threads >= 1, "1 or more")
     target = None if output is None else images.check_output(str(output))
-    added = {} if aovs is None else {"aovs": channels.aov_list(aovs)}
-    loaded, own = loading.as_loaded(scene, integrator, added)
+    check("exposure", exposure, -64 <= exposure <= 64, "a number from -64 to 64")
+    check(
+        "denoise",
+        denoise,
+        not denoise or part is None,
+        "left out with part: denoise the merged image",
+    )
+    if denoise:
+        denoising.check_installed()
+    loaded, own = _loaded(scene, integrator, aovs, denoise)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
+    watch = None if tev is None else _viewer(tev, job, target)
     with thread_count(threads):
-        run(job, state, store, progress or (lambda _: None))
-    return _finished(job, state, store, facts, target)
+        run(job, state, store, progress or (lambda _: None), watch=watch)
+    result = result_of(job, state)
+    if denoise:
+        _denoise(job, result)
+    return _finished(job, result, state, store, facts, target, exposure)
+
+
+def _loaded(scene, integrator, aovs, denoise: bool):
+    """Return the scene with the channels that are wanted of its integrator, and that to use."""
+    wanted = denoising.with_guides(aovs) if denoise else aovs
+    added = {} if wanted is None else {"aovs": channels.aov_list(wanted)}
+    if added and aovs is None:
+        added["aovs"] = Wish(added["aovs"])
+    return loading.as_loaded(scene, integrator, added)
+
+
+def _viewer(address: str, job: Job, target: Path | None) -> Callable[[State], None]:
+    """Return what shows the state in tev."""
+    viewer = live.Viewer(address, target.name if target else "manylights")
+    return lambda state: viewer.show(state, job.driver.adjoint, job.loaded.exposure)
 
 
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
@@ -158,8 +199,19 @@ def part_path(target: str | Path, part: Part) -> Path:
     return Path(target).with_suffix(f".{part.name()}.exr")
 
 
-def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -> RenderResult:
-    result = result_of(job, state)
+def _denoise(job: Job, result: RenderResult) -> None:
+    names = channels.names(result.bitmap)
+    result.denoised = denoising.denoised(result.image, names)
+    if not job.film.rfilter().is_box_filter():
+        result.notes.append(
+            "denoise: the film's filter spreads noise over pixels, which looks like texture; "
+            'with <rfilter type="box"/> less of it is left'
+        )
+
+
+def _finished(
+    job: Job, result: RenderResult, state: State, store, facts, target: Path | None, stops: float
+) -> RenderResult:
     if target is not None and job.part is not None:
         path = part_path(target, job.part)
         Checkpoint(path, job, facts=facts).write(state)
@@ -167,6 +219,7 @@ def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -
     elif target is not None:
         signed = state_file.signature({**facts, "seeds": [job.seed]}, result.samples)
         layers = {**variance_layers(result)}
+        layers |= channels.color_layers(channels.DENOISED, result.denoised)
         attributes = signed | metadata.attributes(job, result, facts["version"])
         number = images.number_of(job.film)
         result.files, notes = images.write_images(
@@ -176,6 +229,8 @@ def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -
             attributes,
             number,
             result.samples,
+            result.denoised,
+            stops,
         )
         result.notes += notes
     if store is not None and store.path not in result.files:
@@ -204,8 +259,17 @@ def run(
     store: Checkpoint | None,
     progress: Callable[[Progress], None],
     clock: Callable[[], float] = time.perf_counter,
+    watch: Callable[[State], None] | None = None,
 ) -> None:
-    """Render the steps of a job that the state does not have, and add them to it."""
+    """Render the steps of a job that the state does not have, and add them to it.
+
+    Args:
+        job, state: what is rendered.
+        store: keeps the state.
+        progress: called with how far it is.
+        clock: for tests.
+        watch: called with the state after each step; its time does not count.
+    """
     history, driver = state.history, job.driver
 
     def tell(fraction_of_step: float = 0.0, spp: int = 0) -> None:
@@ -234,6 +298,8 @@ def run(
                 state.learnt = driver.learnt()
                 store.keep(state)
             history.seconds += clock() - start
+            if watch is not None:
+                watch(state)
             start = clock()
             tell()
         state.learnt = driver.learnt()
