@@ -118,9 +118,28 @@ def test_what_to_install_is_named(monkeypatch, tmp_path, capsys):
     assert cli.main(command) == 2 and "manylights[denoise]" in capsys.readouterr().err
 
 
-def test_parts_are_denoised_when_they_are_one(oidn):
+def test_parts_are_denoised_when_they_are_one(oidn, tmp_path):
+    whole, files = tmp_path / "a.exr", []
+    manylights.render(box_filtered(), output=whole, spp=4, denoise=True)
+    for number in (1, 2):
+        part = {"part": (number, 2), "aovs": "albedo,normal"}
+        files += manylights.render(box_filtered(), output=tmp_path / "b.exr", spp=4, **part).files
+    merged = tmp_path / "b.exr"
+    manylights.merge(files, merged, denoise=True)
+    assert_same_planes(whole, merged)
+    # Of finished images, too
+    manylights.merge([whole], merged, denoise=True)
+    assert_same_planes(whole, merged)
     with pytest.raises(UsageError, match=r"denoise True: must be left out with part"):
         manylights.render(scene(), spp=1, denoise=True, part=(1, 2))
+
+
+def assert_same_planes(path, other):
+    """The same channels, and the same bits but for what a mean rounds."""
+    first, second = exr.read(path)[0], exr.read(other)[0]
+    assert set(first) == set(second)
+    for name, plane in first.items():
+        np.testing.assert_allclose(plane, second[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 # ------------------------------------------------------------------------------- the preview

@@ -5,6 +5,7 @@ The scene is not needed: the files say how the film makes its image of the sums.
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -14,7 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.errors import UsageError
-from manylights.output import channels, images
+from manylights.output import channels, exr, images
+from manylights.output import denoise as denoising
 from manylights.rendering import metadata, state_file
 from manylights.rendering.develop import WEIGHT, develop
 from manylights.rendering.job import FILMS, STATE, differences
@@ -58,7 +60,10 @@ class Merged:
 
 
 def merge(
-    paths: Iterable[str | Path], output: str | Path | None = None, partial: bool = False
+    paths: Iterable[str | Path],
+    output: str | Path | None = None,
+    partial: bool = False,
+    denoise: bool = False,
 ) -> Merged:
     """Add parts of one render, in any order and grouping, or average renders of several seeds.
 
@@ -70,23 +75,27 @@ def merge(
             finished images that differ in the seed and the number of samples alone.
         output: file (.exr) to write the image to, with a PNG beside it. Default: none.
         partial: also if parts are missing: the output keeps the sums then, and can be merged again.
+        denoise: find the image without noise, too, as ``render`` does; with albedo and normals if
+            the files have them. Not of an image that has parts missing.
 
     Raises:
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
             that comes twice, or one that is missing and ``partial`` is not set.
     """
     target = None if output is None else images.check_output(str(output))
+    if denoise:
+        denoising.check_installed()
     paths = [Path(path) for path in paths]
     if not paths:
         raise UsageError("nothing to merge: no files")
     first, bitmap = state_file.read(paths[0], WHAT, "")
     if first.state is None:
-        return _merge_images(first, bitmap, paths[1:], target)
+        return _merge_images(first, bitmap, paths[1:], target, denoise)
     del bitmap
     total = _Parts(first)
     for path in paths[1:]:
         total.add(state_file.read(path, WHAT, "")[0])
-    return total.finish(target, partial)
+    return total.finish(target, partial, denoise)
 
 
 class _Parts:
@@ -147,7 +156,7 @@ class _Parts:
                 words = run.words(self.steps)
                 raise UsageError(f"{words} comes twice: in {path} and in {saved.path}")
 
-    def finish(self, target: Path | None, partial: bool) -> Merged:
+    def finish(self, target: Path | None, partial: bool, denoise: bool) -> Merged:
         """Make the image, and write it or, if parts are missing, the sums."""
         runs = [run for saved in self.files for run in saved.runs]
         missing = gaps(runs, self.steps)
@@ -168,8 +177,7 @@ class _Parts:
             merged.files = [state_file.write(saved), *previews]
         else:
             own = _signature(self.facts, [self.facts["seed"]], samples)
-            number = _number(self.facts)
-            merged.files, notes = images.write_images(bitmap, target, {}, own, number, samples)
+            notes = _write(merged, target, {}, own, denoise)
         merged.notes += notes
         return merged
 
@@ -218,12 +226,25 @@ def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
     return state_file.signature({**own, "part": "1/1", "seeds": seeds}, samples)
 
 
-def _number(facts: dict) -> type:
-    """Return the numbers of a film's channels in files."""
-    return np.float16 if facts["number"] == "float16" else np.float32
+def _write(merged: Merged, target: Path, layers: dict, own: dict, denoise: bool) -> list[str]:
+    """Write the image of finished parts or images; return notes about that."""
+    names, shown = channels.names(merged.bitmap), None
+    if denoise:
+        pixels = np.array(merged.bitmap, copy=False).reshape(*merged.bitmap.size()[::-1], -1)
+        guides = [name for name in layers if name.startswith(denoising.GUIDES)]
+        planes = [pixels, *(layers[name][..., np.newaxis] for name in guides)]
+        shown = denoising.denoised(np.concatenate(planes, axis=2), [*names, *guides])
+        layers = layers | channels.color_layers(channels.DENOISED, shown)
+    number = np.float16 if json.loads(own[exr.OURS + "number"]) == "float16" else np.float32
+    merged.files, notes = images.write_images(
+        merged.bitmap, target, layers, own, number, merged.samples, shown
+    )
+    return notes
 
 
-def _merge_images(first: Saved, planes: dict, paths: list[Path], target: Path | None) -> Merged:
+def _merge_images(
+    first: Saved, planes: dict, paths: list[Path], target: Path | None, denoise: bool
+) -> Merged:
     """Return the mean of finished images."""
     facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
     names = [name for name in planes if channels.is_averaged(name)]
@@ -252,9 +273,7 @@ def _merge_images(first: Saved, planes: dict, paths: list[Path], target: Path | 
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
         own = _signature(facts, sorted(owners), samples)
-        number = _number(facts)
-        merged.files, notes = images.write_images(bitmap, target, layers, own, number, samples)
-        merged.notes += notes
+        merged.notes += _write(merged, target, layers, own, denoise)
     return merged
 
 

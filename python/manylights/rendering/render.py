@@ -151,7 +151,7 @@ def render(
         "denoise",
         denoise,
         not denoise or part is None,
-        "left out with part: denoise the merged image",
+        "left out with part, and given to manylights.merge",
     )
     if denoise:
         denoising.check_installed()
