@@ -75,7 +75,7 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
      with the types and channels of Mitsuba's :monosp:`aov`: :code:`albedo`, :code:`depth`,
      :code:`position`, :code:`uv`, :code:`geo_normal`, :code:`sh_normal`, :code:`dp_du`,
      :code:`dp_dv`, :code:`duv_dx`, :code:`duv_dy`, :code:`prim_index` and :code:`shape_index`,
-     see below. (Default: none)
+     and :code:`emission`, see below. (Default: none)
 
  * - plan, visibility.counts
    - |int| array
@@ -151,7 +151,8 @@ which is the same with and without them, and are weighted by the same filter; wi
 mirrors, glass and holes, times what these leave of it, and on surfaces without a diffuse lobe all
 that they reflect. :code:`shape_index` counts the shapes in their order in the scene from 1, in all
 variants, and shows of instances the instance. Indices are averaged like all else where a pixel
-has several. Films with bands of their own (:monosp:`specfilm`) take no further channels.
+has several. :code:`emission` is the radiance of the lamp or environment in sight, without the
+media between. Films with bands of their own (:monosp:`specfilm`) take no further channels.
 
 **Parts of a job.** A rendering that is not made by one call follows a plan, the entry
 :code:`plan` of :code:`mi.traverse(integrator)`: four numbers for each pass, its first sample, the

@@ -70,7 +70,8 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
    - Film channels that describe what camera rays meet first, see :monosp:`manylights_direct`:
      :code:`NAME:TYPE` with the types :code:`albedo`, :code:`depth`, :code:`position`,
      :code:`uv`, :code:`geo_normal`, :code:`sh_normal`, :code:`dp_du`, :code:`dp_dv`,
-     :code:`duv_dx`, :code:`duv_dy`, :code:`prim_index` and :code:`shape_index`. (Default: none)
+     :code:`duv_dx`, :code:`duv_dy`, :code:`prim_index`, :code:`shape_index` and
+     :code:`emission`. (Default: none)
 
  * - plan, visibility.counts
    - |int| array

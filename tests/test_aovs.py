@@ -217,6 +217,25 @@ def test_rough_metal_has_what_it_reflects(variant):
     assert (found > 0.85).all() and (found <= 1.0).all()
 
 
+def test_lamps_in_sight_have_their_radiance(variant):
+    lamp = wall(3, size=0.5)
+    lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.0, 1.0]}}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
+    scene = mi.load_dict(box(lamp=lamp, sky=sky, wall={**wall(5, size=1.0), "bsdf": GREY}))
+    for plugin in PLUGINS:
+        integrator = mi.load_dict({"type": plugin, "aovs": "e:emission,d:depth"})
+        found = values(scene, integrator)
+        distance = found[:, 3]
+        exact = np.select(
+            [distance[:, np.newaxis] == 0, distance[:, np.newaxis] < 4],
+            [[0.1, 0.2, 0.3], [3.0, 2.0, 1.0]],
+        )
+        assert len(np.unique(exact[:, 0])) == 3
+        np.testing.assert_allclose(found[:, :3], exact, rtol=1e-6)
+        hiding = mi.load_dict({"type": plugin, "aovs": "e:emission", "hide_emitters": True})
+        assert not values(scene, hiding).any()
+
+
 def test_hidden_lamps_are_not_in_sight(variant):
     scene = box(wall=wall(5), lamp={**wall(3, size=0.5), "emitter": {"type": "area"}})
     for plugin in PLUGINS:
@@ -284,6 +303,12 @@ def test_lamps_stay_merged_where_that_changes_nothing(variant):
     description["integrator"]["aovs"] = channels.aov_list(names)
     apart = np.array(mi.render(mi.load_dict(description), spp=4))
     np.testing.assert_allclose(merged.image[..., 4:], apart[..., 4:], atol=1e-5)
+
+
+@pytest.mark.parametrize("aovs", ["s:shape_index", "a:albedo s:prim_index", "s:prim_index d:depth"])
+def test_lists_with_indices_are_found(aovs):
+    assert set(channels.INDEX_TYPES) & set(channels.aov_types(aovs))
+    assert not set(channels.INDEX_TYPES) & set(channels.aov_types("a:albedo, d:depth n:uv"))
 
 
 @pytest.mark.parametrize("name", ["shape_index", "prim_index"])

@@ -15,6 +15,7 @@ const Parameter &about() { return parameter("aovs"); }
 std::string_view letters(AovType type) {
     switch (type) {
         case AovType::Albedo:
+        case AovType::Emission:
             return "RGB";
         case AovType::Depth:
             return "T";

@@ -25,7 +25,8 @@ enum class AovType {
     DuvDx,
     DuvDy,
     PrimIndex,
-    ShapeIndex
+    ShapeIndex,
+    Emission
 };
 
 /// One of a list, of one to three channels

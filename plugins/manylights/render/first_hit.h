@@ -27,9 +27,15 @@ public:
         if (m_hide_emitters)
             skip_emitters(m_scene, Ray3f(ray), pi, active);
         auto si = pi.compute_surface_interaction(ray, +mitsuba::RayFlags::All, active);
+        Color3f emitted(0.f);
+        for (const Aov &aov : aovs)
+            if (aov.type == AovType::Emission)
+                emitted = emission(si, ray, active);
         dr::masked(si, !si.is_valid()) = dr::zeros<SurfaceInteraction3f>();
         for (const Aov &aov : aovs)
-            values = write(aov.type, si, pi, ray, values, active);
+            values = aov.type == AovType::Emission
+                         ? put(emitted, values)
+                         : write(aov.type, si, pi, ray, values, active);
     }
 
 private:
@@ -66,9 +72,21 @@ private:
             case AovType::PrimIndex:
                 return put(dr::Array<Float, 1>(Float(si.prim_index)), values);
             case AovType::ShapeIndex:
+            case AovType::Emission: // of the environment, too: not of the surface alone
                 break;
         }
         return put(dr::Array<Float, 1>(Float(m_numbers.at(m_scene, si, active))), values);
+    }
+
+    /// Of what is in sight, as it leaves there: media are not considered
+    Color3f emission(const SurfaceInteraction3f &si, const Ray3f &ray,
+                     Mask active) const {
+        auto emitter = si.emitter(m_scene, active);
+        active &= emitter != nullptr && !m_hide_emitters;
+        if (dr::none_or<false>(active))
+            return 0.f;
+        auto radiance = mitsuba::unpolarized_spectrum(emitter->eval(si, active));
+        return VisibleAlbedo<Float, Spectrum>::to_color(radiance & active, ray, active);
     }
 
     /// With the bumps of the material

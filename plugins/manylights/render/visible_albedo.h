@@ -47,6 +47,21 @@ public:
         return to_color(result, ray, active);
     }
 
+    /// In the colours of the film, as Mitsuba's `aov` does it
+    static Color3f to_color(const UnpolarizedSpectrum &spectrum, const Ray3f &ray,
+                            Mask active) {
+        if constexpr (mitsuba::is_monochromatic_v<Spectrum>) {
+            return Color3f(spectrum.x());
+        } else if constexpr (mitsuba::is_rgb_v<Spectrum>) {
+            return spectrum;
+        } else {
+            auto pdf = mitsuba::pdf_rgb_spectrum(ray.wavelengths);
+            return mitsuba::spectrum_to_srgb(
+                spectrum * dr::select(pdf != 0.f, dr::rcp(pdf), 0.f), ray.wavelengths,
+                active);
+        }
+    }
+
 private:
     struct Walk {
         Ray3f ray;
@@ -173,21 +188,6 @@ private:
                                    bits(ray.d.y()) ^ (bits(ray.o.y()) * 0xc2b2ae35u));
         using UInt64 = dr::uint64_array_t<UInt32>;
         return dr::PCG32<UInt32>(1, UInt64(a) + dr::sl<32>(UInt64(b)), UInt64(1));
-    }
-
-    /// In the colours of the film, as Mitsuba's `aov` does it
-    static Color3f to_color(const UnpolarizedSpectrum &spectrum, const Ray3f &ray,
-                            Mask active) {
-        if constexpr (mitsuba::is_monochromatic_v<Spectrum>) {
-            return Color3f(spectrum.x());
-        } else if constexpr (mitsuba::is_rgb_v<Spectrum>) {
-            return spectrum;
-        } else {
-            auto pdf = mitsuba::pdf_rgb_spectrum(ray.wavelengths);
-            return mitsuba::spectrum_to_srgb(
-                spectrum * dr::select(pdf != 0.f, dr::rcp(pdf), 0.f), ray.wavelengths,
-                active);
-        }
     }
 
     const Scene *m_scene;

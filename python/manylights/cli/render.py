@@ -112,7 +112,7 @@ def _add_layers(parser) -> None:
         "--denoise",
         action="store_true",
         help="add layers denoised.* by Open Image Denoise and show them in the PNG; implies "
-        "--aov albedo,normal (needs manylights[denoise])",
+        "--aov albedo,normal,emission (needs manylights[denoise])",
     )
     parser.add_argument(
         "--exposure",

@@ -64,7 +64,7 @@ SAMPLING_PARAMETERS = {
 #: Channels that describe the surfaces in sight.
 AOVS = Parameter(
     "NAME:TYPE between commas with the TYPE albedo, depth, position, uv, geo_normal, sh_normal, "
-    "dp_du, dp_dv, duv_dx, duv_dy, prim_index or shape_index",
+    "dp_du, dp_dv, duv_dx, duv_dy, prim_index, shape_index or emission",
     "none",
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,7 +50,7 @@ AOVS = {
     "uv": ("uv", "uv"),
     "shape_index": ("shape_index", "shape_index"),
     "prim_index": ("prim_index", "prim_index"),
-    **{name: (name, name) for name in ("dp_du", "dp_dv", "duv_dx", "duv_dy")},
+    **{name: (name, name) for name in ("dp_du", "dp_dv", "duv_dx", "duv_dy", "emission")},
 }
 
 #: The types in which merged lamps would not be what they were.
@@ -93,8 +94,8 @@ def aov_list(names: str | Sequence[str], option: str = "aovs") -> str:
 
 
 def aov_types(text: str) -> list[str]:
-    """Return the types in a parameter ``aovs``."""
-    return [pair.rpartition(":")[2].strip() for pair in text.split(",")]
+    """Return the types in a parameter ``aovs``, which may have commas or spaces between."""
+    return [pair.rpartition(":")[2] for pair in re.split(r"[,\s]+", text)]
 
 
 def is_beauty(name: str) -> bool:

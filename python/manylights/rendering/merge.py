@@ -231,9 +231,12 @@ def _write(merged: Merged, target: Path, layers: dict, own: dict, denoise: bool)
     names, shown = channels.names(merged.bitmap), None
     if denoise:
         pixels = np.array(merged.bitmap, copy=False).reshape(*merged.bitmap.size()[::-1], -1)
-        guides = [name for name in layers if name.startswith(denoising.GUIDES)]
+        kinds = (*denoising.GUIDES, denoising.EMISSION)
+        guides = [name for name in layers if name.startswith(kinds)]
         planes = [pixels, *(layers[name][..., np.newaxis] for name in guides)]
-        shown = denoising.denoised(np.concatenate(planes, axis=2), [*names, *guides])
+        exposure = float(json.loads(own[exr.OURS + "exposure"]))
+        pixels = np.concatenate(planes, axis=2)
+        shown = denoising.denoised(pixels, [*names, *guides], exposure)
         layers = layers | channels.color_layers(channels.DENOISED, shown)
     number = np.float16 if json.loads(own[exr.OURS + "number"]) == "float16" else np.float32
     merged.files, notes = images.write_images(

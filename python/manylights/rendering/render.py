@@ -7,22 +7,20 @@ from four independent images that are rendered in turn.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from manylights import loading
 from manylights.errors import UsageError
-from manylights.loading.integrators import Wish
 from manylights.output import channels, images
-from manylights.output import denoise as denoising
 from manylights.rendering import checkpoint as checkpoints
-from manylights.rendering import live, metadata, state_file
+from manylights.rendering import metadata, state_file
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
+from manylights.rendering.extras import Extras
 from manylights.rendering.job import Job, check
 from manylights.rendering.parts import Part
 from manylights.rendering.state import State
@@ -93,12 +91,9 @@ def render(
     checkpoint_seconds: float = 60.0,
     part: tuple[int, int] | Part | None = None,
     learnt: str | Path | None = None,
-    aovs: str | Sequence[str] | None = None,
-    denoise: bool = False,
-    exposure: float = 0.0,
-    tev: str | None = None,
     progress: Callable[[Progress], None] | None = None,
     threads: int | None = None,
+    **extras: Any,
 ) -> RenderResult:
     """Render a scene: a number of samples, or until an image is good enough or a time is up.
 
@@ -110,8 +105,7 @@ def render(
             of ``manylights.usd.load``; an ``mi.Scene``, which is rendered as it is; or what
             ``manylights.loading.load`` returned. Of files and dictionaries ``direct``, ``path`` and
             ``volpath`` are replaced by our integrators, ``independent`` by ``manylights_sobol``.
-        spp: samples per pixel, 1 or more; with a target the most there may be. Default: what the
-            scene's sampler says, with a target 65536.
+        spp: samples per pixel, with a target the most. Default: the sampler's, or 65536.
         seed: of the random numbers, 0 to 4294967295.
         sensor: index of the sensor, from 0.
         integrator: ``None`` for the choice above, ``"keep"`` for the scene's own, the name of a
@@ -119,68 +113,30 @@ def render(
         until_noise: render until ``RenderResult.noise`` is this, above 0: 0.02 is 2 %.
         seconds: render for so long, above 0. The last step may end later, by its length or 5 %.
         output: file (.exr) to write the image to, with a PNG beside it. Default: none.
-        checkpoint: file (.exr) that keeps the state, to go on from there another time. Removed once
-            there is an image. Default: the state is not kept.
+        checkpoint: file (.exr) of the state, to go on from another time; removed at the end.
         checkpoint_seconds: at least between two writings of it.
-        part: ``(3, 16)`` renders the third of 16 shares of the steps, with ``output="a.exr"`` to
-            ``a.part-03-of-16.exr``, for ``manylights.merge``. Default: all, without parts.
+        part: ``(3, 16)`` renders a share of the steps, to OUT.part-03-of-16.exr. Default: all.
         learnt: file of another part, to take over what is learnt. Default: learn it anew.
-        aovs: channels that describe the surfaces in sight, "albedo,normal,depth" or a list:
-            ``albedo``, ``normal``, ``geo_normal``, ``position``, ``depth``, ``uv``,
-            ``shape_index``, ``prim_index``, ``dp_du``, ``dp_dv``, ``duv_dx``, ``duv_dy``. For
-            scenes that are not loaded yet. Default: none.
-        denoise: find the image without noise, too, by Open Image Denoise (mitsuba-oidn), from
-            ``albedo`` and ``normal`` where the scene is not loaded yet and the integrator is ours.
-            The file has it in ``denoised.*``, the PNG shows it, the image stays as it is.
-        exposure: stops by which the PNG is brighter, from -64 to 64.
-        tev: ``HOST:PORT`` (empty: this machine) of the viewer tev, which gets the picture after
-            each step, by the package tevclient. Default: none.
         progress: called before the first step and after each, in scalar variants also in between
             and from other threads. What it raises ends the render.
         threads: CPU threads, 1 or more. Default: those that Mitsuba uses.
+        extras: ``aovs``, ``denoise``, ``exposure`` and ``tev``, see ``rendering.extras.Extras``.
 
     Raises:
-        UsageError: (a ``ValueError``) a number out of range, no such file or sensor, no parts of
-            such a render, a file of another render.
+        UsageError: (a ``ValueError``) an argument, file or scene that cannot be.
         RuntimeError: Mitsuba cannot read or render the scene.
     """
     check("threads", threads, threads is None or threads >= 1, "1 or more")
     target = None if output is None else images.check_output(str(output))
-    check("exposure", exposure, -64 <= exposure <= 64, "a number from -64 to 64")
-    check(
-        "denoise",
-        denoise,
-        not denoise or part is None,
-        "left out with part, and given to manylights.merge",
-    )
-    if denoise:
-        denoising.check_installed()
-    loaded, own = _loaded(scene, integrator, aovs, denoise)
+    wanted = Extras.of(extras, part)
+    loaded, own = wanted.load(scene, integrator)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
-    watch = None if tev is None else _viewer(tev, job, target)
+    watch = wanted.prepare(job, target)
     with thread_count(threads):
         run(job, state, store, progress or (lambda _: None), watch=watch)
-    result = result_of(job, state)
-    if denoise:
-        _denoise(job, result)
-    return _finished(job, result, state, store, facts, target, exposure)
-
-
-def _loaded(scene, integrator, aovs, denoise: bool):
-    """Return the scene with the channels that are wanted of its integrator, and that to use."""
-    wanted = denoising.with_guides(aovs) if denoise else aovs
-    added = {} if wanted is None else {"aovs": channels.aov_list(wanted)}
-    if added and aovs is None:
-        added["aovs"] = Wish(added["aovs"])
-    return loading.as_loaded(scene, integrator, added)
-
-
-def _viewer(address: str, job: Job, target: Path | None) -> Callable[[State], None]:
-    """Return what shows the state in tev."""
-    viewer = live.Viewer(address, target.name if target else "manylights")
-    return lambda state: viewer.show(state, job.driver.adjoint, job.loaded.exposure)
+    return _finished(job, state, store, facts, target, wanted)
 
 
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
@@ -199,19 +155,11 @@ def part_path(target: str | Path, part: Part) -> Path:
     return Path(target).with_suffix(f".{part.name()}.exr")
 
 
-def _denoise(job: Job, result: RenderResult) -> None:
-    names = channels.names(result.bitmap)
-    result.denoised = denoising.denoised(result.image, names)
-    if not job.film.rfilter().is_box_filter():
-        result.notes.append(
-            "denoise: the film's filter spreads noise over pixels, which looks like texture; "
-            'with <rfilter type="box"/> less of it is left'
-        )
-
-
 def _finished(
-    job: Job, result: RenderResult, state: State, store, facts, target: Path | None, stops: float
+    job: Job, state: State, store, facts: dict, target: Path | None, wanted: Extras
 ) -> RenderResult:
+    result = result_of(job, state)
+    wanted.add_denoised(job, result)
     if target is not None and job.part is not None:
         path = part_path(target, job.part)
         Checkpoint(path, job, facts=facts).write(state)
@@ -230,7 +178,7 @@ def _finished(
             number,
             result.samples,
             result.denoised,
-            stops,
+            wanted.exposure,
         )
         result.notes += notes
     if store is not None and store.path not in result.files:
