@@ -116,6 +116,18 @@ def test_channels_are_those_of_mitsuba(plugin, variant):
         np.testing.assert_array_equal(found[:, index], wanted[:, index], err_msg=name)
 
 
+@pytest.mark.parametrize("spectra", ["scalar_spectral", "llvm_ad_mono_polarized"])
+def test_albedo_is_that_of_mitsuba_in_all_spectra(spectra):
+    require_variant(spectra)
+    scene = mi.load_dict(objects())
+    found, wanted = (
+        values(scene, mi.load_dict({"type": plugin, "aovs": "a:albedo"}))
+        for plugin in ("manylights_volpath", "aov")
+    )
+    np.testing.assert_allclose(found, np.clip(wanted, 0, None), rtol=1e-5, atol=1e-6)
+    assert np.ptp(found) > 0.3
+
+
 def test_a_wrong_channel_would_be_seen(variant):
     scene = mi.load_dict(objects())
     ours = mi.load_dict({"type": "manylights_direct", "aovs": "n:geo_normal"})
@@ -380,7 +392,8 @@ def test_bad_lists_are_named(aovs, message, plugin):
 
 def test_an_empty_list_is_none():
     require_variant("scalar_rgb")
-    assert mi.load_dict({"type": PLUGINS[0], "aovs": ""}).aov_names() == []
+    for aovs in ("", "none"):
+        assert mi.load_dict({"type": PLUGINS[0], "aovs": aovs}).aov_names() == []
 
 
 @pytest.mark.parametrize(

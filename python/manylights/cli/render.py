@@ -33,6 +33,12 @@ turn, their differences tell the noise, and how many samples will be needed is p
 --for TIME renders for so long. --spp is the limit of both (65536 without). The noise is
 in the attribute manylights.noise of the file.
 
+The file has one part. Colours and alpha have the film's number format, layers 32 bits:
+--aov albedo,normal,position,depth,uv gives albedo.R, normal.X, P.X, Z, uv.U and so on, of
+the surfaces in sight and from the same rays; parameters counts=true gives counts.*;
+--until-noise and --for give variance.*; with layers there is samples. --denoise adds
+denoised.*, best with a box filter, and leaves the image as it is.
+
 With --checkpoint the state of the render is kept in OUT.checkpoint.exr, a picture, too,
 after each step that ends SECONDS or more after the last one was written. After a crash, a
 kill or Ctrl-C the same command goes on from there, and the image is the same, bit for
