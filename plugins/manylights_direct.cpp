@@ -69,6 +69,14 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
      should arrive by what is known of their visibility, all of it where nothing is known, 0
      where shadow rays are traced to all lights. (Default: no, i.e. |false|)
 
+ * - aovs
+   - |string|
+   - Film channels that describe what camera rays meet first: pairs :code:`NAME:TYPE` between commas,
+     with the types and channels of Mitsuba's :monosp:`aov`: :code:`albedo`, :code:`depth`,
+     :code:`position`, :code:`uv`, :code:`geo_normal`, :code:`sh_normal`, :code:`dp_du`,
+     :code:`dp_dv`, :code:`duv_dx`, :code:`duv_dy`, :code:`prim_index` and :code:`shape_index`,
+     and :code:`emission`, see below. (Default: none)
+
  * - light_groups
    - |string|
    - Groups of lights whose light has film layers of its own, see below:
@@ -140,6 +148,16 @@ Nothing is learnt from images with fewer than :math:`2^{19}` samples in LLVM var
 considered anyway, and while differentiating; an integrator that is nested in others which only ask
 it for samples uses what it has kept, and learns nothing. What was kept is dropped with the
 integrator: load another one to start anew.
+
+**Surfaces in sight.** The channels of :code:`aovs` come from the same camera rays as the image,
+which is the same with and without them, and are weighted by the same filter; with
+:code:`hide_emitters` they do not show emitters either. Where nothing is met they are 0.
+:code:`albedo` is for denoisers: that of the first surface that scatters light widely, seen through
+mirrors, glass and holes, times what these leave of it, and on surfaces without a diffuse lobe all
+that they reflect. :code:`shape_index` counts the shapes in their order in the scene from 1, in all
+variants, and shows of instances the instance. Indices are averaged like all else where a pixel
+has several. :code:`emission` is the radiance of the lamp or environment in sight, without the
+media between. Films with bands of their own (:monosp:`specfilm`) take no further channels.
 
 **Parts of a job.** A rendering that is not made by one call follows a plan, the entry
 :code:`plan` of :code:`mi.traverse(integrator)`: four numbers for each pass, its first sample, the
@@ -220,6 +238,7 @@ public:
                 });
             });
         write_layers(groups, weight, ray, aovs, active);
+        Base::write_aovs(scene, ray, aovs, m_hide_emitters, active);
         return result;
     }
 
@@ -270,7 +289,7 @@ public:
     std::string to_string() const override {
         std::ostringstream oss;
         oss << "ManyLightsDirect[" << std::endl
-            << "  " << string::indent(manylights::to_string(m_params)) << "," << std::endl
+            << "  " << string::indent(Base::describe_parameters()) << "," << std::endl
             << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << ","
             << std::endl
             << "  tree = " << string::indent(m_cache.to_string()) << std::endl

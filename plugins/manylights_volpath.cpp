@@ -65,6 +65,14 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
      :code:`expected` as :monosp:`manylights_direct`, summed over the vertices.
      (Default: no, i.e. |false|)
 
+ * - aovs
+   - |string|
+   - Film channels that describe what camera rays meet first, see :monosp:`manylights_direct`:
+     :code:`NAME:TYPE` with the types :code:`albedo`, :code:`depth`, :code:`position`,
+     :code:`uv`, :code:`geo_normal`, :code:`sh_normal`, :code:`dp_du`, :code:`dp_dv`,
+     :code:`duv_dx`, :code:`duv_dy`, :code:`prim_index`, :code:`shape_index` and
+     :code:`emission`. (Default: none)
+
  * - light_groups
    - |string|
    - Groups of lights whose light has film layers of its own, see
@@ -190,13 +198,14 @@ public:
         write_layers(groups, weight, ray, aovs, active);
         if (m_params.counts)
             counts.write(aovs, m_params);
+        Base::write_aovs(scene, ray, aovs, m_hide_emitters, active);
         return result;
     }
 
     std::string to_string() const override {
         std::ostringstream oss;
         oss << "ManyLightsVolpath[" << std::endl
-            << "  " << string::indent(manylights::to_string(m_params)) << "," << std::endl
+            << "  " << string::indent(Base::describe_parameters()) << "," << std::endl
             << "  max_depth = " << (int) m_max_depth << "," << std::endl
             << "  rr_depth = " << (int) m_rr_depth << "," << std::endl
             << "  hide_emitters = " << (m_hide_emitters ? "true" : "false") << ","

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from manylights import cli, loading
 from manylights.errors import UsageError
-from manylights.output import images
+from manylights.output import exr
 from manylights.progress import Estimate
 from manylights.rendering import Job, checkpoint, plan
 from manylights.rendering.driver import Driver
@@ -391,16 +391,16 @@ def test_what_killed_processes_left_is_removed(wide, tmp_path):
 
 def test_checkpoint_that_cannot_be_written_does_not_stop_the_render(run, monkeypatch, tmp_path):
     """Nor does it take the one before away."""
-    write_whole, seen = images.write_whole, []
+    write, seen = exr.write, []
 
-    def fail_once(bitmap, target, file_format):
+    def fail_once(target, planes, attributes):
         if target.name == "out.checkpoint.exr":
             seen.append(target.exists())
             if len(seen) == 2:
                 raise UsageError("no room, says the test")
-        return write_whole(bitmap, target, file_format)
+        return write(target, planes, attributes)
 
-    monkeypatch.setattr(images, "write_whole", fail_once)
+    monkeypatch.setattr(exr, "write", fail_once)
     status, log = run()
     assert status == 0 and log.count("no checkpoint written, the render goes on: no room") == 1
     assert seen == [False, True, True, True]

@@ -1,5 +1,8 @@
 """Files that renders leave: channels and attributes, as other programs read them, too."""
 
+import subprocess
+import sys
+
 import manylights
 import mitsuba as mi
 import numpy as np
@@ -160,3 +163,36 @@ def test_images_without_a_name_for_layers_are_as_before(tmp_path):
     written, notes = images.write_images(bitmap, tmp_path / "a.exr")
     assert [path.name for path in written] == ["a.exr", "a.png"] and not notes
     assert (np.array(mi.Bitmap(str(written[0]))) == 1).all()
+
+
+# ----------------------------------------------------------------------------------- memory
+
+LARGE = """
+import resource, sys
+import mitsuba as mi, numpy as np
+mi.set_variant("scalar_rgb")
+from pathlib import Path
+from manylights.output import channels, images
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+height, width, count = 2160, 3840, 20
+names = ["R", "G", "B"] + [f"layer{number}.X" for number in range(count - 3)]
+row = np.linspace(0, 1, width, dtype=np.float32)
+bitmap = channels.join(names, np.broadcast_to(row[None, :, None], (height, width, count)))
+before = peak()
+images.write_images(bitmap, Path(sys.argv[1]), number=np.float16, samples=4)
+print((peak() - before) / (4 * height * width * count))
+"""
+
+
+@pytest.mark.slow
+def test_large_files_take_two_copies_of_their_pixels(tmp_path):
+    """3840 x 2160 pixels with 20 layers: beside the image, as the documentation says."""
+    path = tmp_path / "large.exr"
+    command = [sys.executable, "-c", LARGE, str(path)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert float(done.stdout) < 2.2
+    names, size, _ = exr.read_header(path)
+    assert size == (3840, 2160) and len(names) == 21

@@ -61,6 +61,8 @@ def range_in_words(about):
         return either(["true", "false", *about["texts"]])
     if about["type"] == "string":
         return either(about["texts"]) if about["texts"] else "text"
+    if about["type"] == "list":
+        return f"NAME:TYPE between commas with the TYPE {either(about['texts'])}"
     if about["type"] == "float":
         return either([f"float >= {about['low']:g}", *about["texts"]])
     if about["high_name"]:
@@ -78,7 +80,8 @@ def mistakes_in_documentation(text, table):
     wrong = [f"only on one side: {name}" for name in found.keys() ^ table.keys()]
     for name in found.keys() & table.keys():
         kind, about, wanted = *found[name], table[name]
-        types = [wanted["type"], *["string"] * (wanted["type"] == "bool" and bool(wanted["texts"]))]
+        types = [wanted["type"].replace("list", "string")]
+        types += ["string"] * (wanted["type"] == "bool" and bool(wanted["texts"]))
         if kind != " or ".join(f"|{each}|" for each in types):
             wrong.append(f"{name}: type {kind}")
         if not about.endswith(default_in_words(wanted)):

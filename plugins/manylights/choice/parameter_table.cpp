@@ -41,6 +41,10 @@ Parameter text(std::string_view name, Texts texts) {
 
 /// Any text, none if it is not given
 Parameter free_text(std::string_view name) { return text(name, {}); }
+/// Pairs of a name and one of some texts; none if it is not given
+Parameter list(std::string_view name, Texts texts) {
+    return { name, kBoth, Type::List, 0, 0, 0, "", texts, {}, false, "" };
+}
 
 /// With its meaning, and the methods that it is for (none: all)
 Parameter with(Parameter p, std::string_view meaning, std::vector<Method> methods = {}) {
@@ -75,6 +79,10 @@ std::vector<Parameter> make_table() {
              "learn which lights can be seen from where", { M::ResampledTree }),
         with(boolean("counts", kBoth, false), "film channels with numbers of candidates"),
         with(free_text("light_groups"), "film layers with the light of groups"),
+        with(list("aovs", { "albedo", "depth", "position", "uv", "geo_normal",
+                            "sh_normal", "dp_du", "dp_dv", "duv_dx", "duv_dy",
+                            "prim_index", "shape_index", "emission" }),
+             "film channels that describe the surfaces in sight"),
         with(integer("bsdf_samples", kDirect, 1, 0, 1024), "rays sampled from the BSDF"),
         inherited(integer("max_depth", kVolpath, -1, -1, kInfinity), "longest path"),
         inherited(integer("rr_depth", kVolpath, 5, 1, kInfinity),
@@ -99,14 +107,18 @@ std::string Parameter::allowed(double high) const {
         oss << "an integer from " << low << " to " << high;
     else if (type == Type::Number)
         oss << "a number >= " << low;
+    else if (type == Type::List)
+        oss << "pairs NAME:TYPE between commas with a TYPE of ";
     for (size_t i = 0; i < texts.size(); ++i)
-        oss << (i > 0 || type != Type::Text ? " or \"" : "\"") << texts[i] << "\"";
+        oss << (i > 0 || type < Type::Text ? " or \"" : "\"") << texts[i] << "\"";
     return oss.str();
 }
 
 std::string Parameter::text_of(double value) const {
     if (type == Type::Text)
         return texts.empty() ? "" : std::string(texts[(size_t) value]);
+    if (type == Type::List)
+        return "none";
     if (type == Type::Boolean)
         return value > 1 ? std::string(texts[0]) : value > 0 ? "true" : "false";
     std::ostringstream oss;

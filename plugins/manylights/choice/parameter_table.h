@@ -18,7 +18,7 @@ enum class Method { ResampledTree, Talk, AdaptiveSplitting, Tree, Exhaustive };
 enum Plugins : unsigned { kDirect = 1, kVolpath = 2, kBoth = 3 };
 
 struct Parameter {
-    enum class Type { Boolean, Integer, Number, Text };
+    enum class Type { Boolean, Integer, Number, Text, List };
 
     std::string_view name;
     unsigned plugins;
@@ -28,8 +28,8 @@ struct Parameter {
     /// Range of numbers; the parameter of this name, if any, is the upper end instead
     double low, high;
     std::string_view high_name;
-    /// What a text may be (none: anything), or else what may be given in place of a boolean (with the value 2) or a
-    /// number (infinity)
+    /// What a text may be (none: anything), or the second half of each pair of a list, or else
+    /// what may be given in place of a boolean (with the value 2) or a number (infinity)
     std::vector<std::string_view> texts;
     /// Methods in which it has an effect; given with others it is a mistake
     std::vector<Method> methods;

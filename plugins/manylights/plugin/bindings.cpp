@@ -285,7 +285,7 @@ nb::list parameters(const std::string &plugin) {
     for (const Parameter &each : parameter_table()) {
         if (!(each.plugins & wanted))
             continue;
-        const char *types[] = { "bool", "int", "float", "string" };
+        const char *types[] = { "bool", "int", "float", "string", "list" };
         std::vector<std::string> methods, texts(each.texts.begin(), each.texts.end());
         for (Method method : each.methods)
             methods.emplace_back(name_of(method));

@@ -6,8 +6,9 @@
  */
 
 #include "camera_sample.h"
+#include "film_channels.h"
+#include "first_hit.h"
 #include "learning_passes.h"
-#include "manylights/choice/parameters.h"
 #include "manylights/scene/light_cache.h"
 #include "ordered_blocks.h"
 #include "wavefronts.h"
@@ -29,8 +30,8 @@ public:
     using Learning = LearningPasses<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
-        : Base(props), m_params(params), m_cache(m_params), m_learning(m_params),
-          m_first_layer(count_channels(params).size()) {}
+        : Base(props), m_params(params), m_aovs(read_aovs(props)), m_cache(m_params),
+          m_channels(m_params, m_aovs), m_learning(m_params) {}
 
     /**
      * As `sample`, with the weight of the ray for the layers of light groups (null: that of a
@@ -67,6 +68,7 @@ public:
         dr::scoped_flush_denormals flush(true);
         auto lock = lock_rendering();
         typename Cache::Rendering guard(m_cache, scene);
+        prepare_channels(scene, sensor->film());
         if (m_rendering || m_differentiating || m_samples_per_pass != kOnePass ||
             has_entry_for_each_sample(sensor))
             return Base::render(scene, sensor, seed, spp, develop, evaluate);
@@ -88,12 +90,10 @@ public:
         Base::render_backward(scene, params, grad_in, sensor, seed, spp);
     }
 
-    std::vector<std::string> aov_names() const override {
-        std::vector<std::string> names = count_channels(m_params);
-        for (std::string &name : group_channels(m_params.light_groups))
-            names.push_back(std::move(name));
-        return names;
-    }
+    std::vector<std::string> aov_names() const override { return m_channels.names; }
+
+    /// How many of these describe surfaces: what else is computed does not depend on them
+    size_t aov_count() const { return m_channels.aov_count(); }
 
     void traverse(mitsuba::TraversalCallback *cb) override {
         Base::traverse(cb);
@@ -127,19 +127,47 @@ protected:
     void write_layers(const Sums &sums, const Spectrum *weight,
                       const RayDifferential3f &ray, Float *aovs, Mask active) const {
         if (sums.size() > 0)
-            manylights::write_layers<Float, Spectrum>(sums, weight, ray.wavelengths,
-                                                      aovs ? aovs + m_first_layer : aovs,
-                                                      active);
+            manylights::write_layers<Float, Spectrum>(
+                sums, weight, ray.wavelengths, aovs ? aovs + m_channels.groups : aovs,
+                active);
+    }
+
+    /// Write the channels of the surfaces in sight; null: the caller has none
+    void write_aovs(const Scene *scene, const RayDifferential3f &ray, Float *channels,
+                    bool hide_emitters, Mask active) const {
+        if (m_aovs.empty() || !channels)
+            return;
+        FirstHit<Float, Spectrum>(scene, m_shape_numbers, hide_emitters)
+            .write(m_aovs, ray, channels + m_channels.aovs, active);
+    }
+
+    /// "name = value" lines of what has an effect
+    std::string describe_parameters() const {
+        std::string aovs = m_aovs.empty() ? "" : ",\naovs = " + to_string(m_aovs);
+        return manylights::to_string(m_params) + aovs;
     }
 
     SamplingParameters m_params;
+    std::vector<Aov> m_aovs;
     Cache m_cache;
+    FilmChannels m_channels;
 
 private:
     using Renderer = std::conditional_t<dr::is_jit_v<Float>,
                                         Wavefronts<Float, Spectrum, LightIntegrator>,
                                         OrderedBlocks<Float, Spectrum, LightIntegrator>>;
     static constexpr uint32_t kOnePass = (uint32_t) -1; // Mitsuba's default
+
+    void prepare_channels(const Scene *scene, const Film *film) const {
+        if (has_flag(film->flags(), mitsuba::FilmFlags::Special) && !aov_names().empty())
+            throw std::runtime_error(
+                "The film \"" + std::string(film->class_name()) +
+                "\" has bands of its own and takes no further channels: give \"counts\" "
+                "and \"aovs\" to an integrator with an \"hdrfilm\".");
+        for (const Aov &aov : m_aovs)
+            if (aov.type == AovType::ShapeIndex)
+                m_shape_numbers.prepare(scene);
+    }
 
     /// One integrator has one rendering at a time: others that overlap wait for it
     std::unique_lock<std::recursive_mutex> lock_rendering() {
@@ -211,7 +239,7 @@ private:
             m_learning.start_pass(plan[i]);
             Pass pass(plan[i], seed, spp, job, sampler);
             renderer.render(pass);
-            m_learning.end_pass(plan[i], film, m_first_layer);
+            m_learning.end_pass(plan[i], film, m_channels.groups);
         }
         if constexpr (dr::is_jit_v<Float>)
             Log(mitsuba::Info, "Computation graph recorded and compiled. (took %s)",
@@ -261,8 +289,7 @@ private:
     mitsuba::DynamicBuffer<UInt32> m_plan_numbers;
     PassPlan m_plan;
     Learning m_learning;
-    /// Of the film's channels that are not colours, the first one with light of a group
-    size_t m_first_layer;
+    ShapeNumbers<Float, Spectrum> m_shape_numbers;
 };
 
 } // namespace manylights

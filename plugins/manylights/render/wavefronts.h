@@ -54,8 +54,10 @@ private:
     static constexpr uint32_t kPartBytes = 1u << 30;
 
     uint32_t most_lanes(uint32_t samples) const {
+        // Those of surfaces do not count: with them the image has the same parts
+        size_t channels = m_channels - m_integrator.aov_count();
         uint32_t numbers =
-            (uint32_t) m_channels + 2 + Sums::stored(m_film, m_channels) / samples;
+            (uint32_t) channels + 2 + Sums::stored(m_film, channels) / samples;
         uint32_t wanted = kPartBytes / ((uint32_t) sizeof(ScalarFloat) * numbers);
         uint32_t result = 1;
         while (2 * result <= wanted)

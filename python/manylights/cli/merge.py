@@ -38,13 +38,18 @@ def add(commands, common) -> None:
     parser.add_argument(
         "--partial", action="store_true", help="write what is there, also if parts are missing"
     )
+    parser.add_argument(
+        "--denoise",
+        action="store_true",
+        help="add layers denoised.* and show them in the PNG, as manylights render does",
+    )
     parser.set_defaults(command=_run)
 
 
 def _run(options) -> None:
     mi.set_variant("scalar_rgb")
     images.check_output(options.output)
-    merged = merge(options.parts, options.output, options.partial)
+    merged = merge(options.parts, options.output, options.partial, options.denoise)
     for note in merged.notes:
         say(note)
     names = " and ".join(str(path) for path in merged.files)

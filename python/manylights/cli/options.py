@@ -152,6 +152,14 @@ def share(text: str) -> float:
     return value
 
 
+def stops(text: str) -> float:
+    """Factors of two, of both signs."""
+    value = number(text)
+    if not -64.0 <= value <= 64.0:
+        raise argparse.ArgumentTypeError(f"{text}: must be a number from -64 to 64")
+    return value
+
+
 def part(text: str) -> Part:
     """A part of several: 3/16."""
     numbers = text.split("/")

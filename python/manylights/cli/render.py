@@ -10,9 +10,9 @@ from manylights import loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
 from manylights.loading import integrators
-from manylights.output import images
+from manylights.output import channels, denoise, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
-from manylights.rendering import Progress, RenderResult, render
+from manylights.rendering import Progress, RenderResult, live, render
 from manylights.rendering.checkpoint import path_for
 from manylights.rendering.parts import Part
 from manylights.rendering.render import part_path
@@ -40,6 +40,12 @@ the pixels, without the worst 0.1 %; 0.02 is 2 %. Four independent images are re
 turn, their differences tell the noise, and how many samples will be needed is predicted.
 --for TIME renders for so long. --spp is the limit of both (65536 without). The noise is
 in the attribute manylights.noise of the file.
+
+The file has one part. Colours and alpha have the film's number format, layers 32 bits:
+--aov albedo,normal,position,depth,uv gives albedo.R, normal.X, P.X, Z, uv.U and so on, of
+the surfaces in sight and from the same rays; parameters counts=true gives counts.*;
+--until-noise and --for give variance.*; with layers there is samples. --denoise adds
+denoised.*, best with a box filter, and leaves the image as it is.
 
 With --checkpoint the state of the render is kept in OUT.checkpoint.exr, a picture, too,
 after each step that ends SECONDS or more after the last one was written. After a crash, a
@@ -109,26 +115,57 @@ def add(commands, common) -> None:
         metavar="SECONDS",
         help="keep the state every so often; after an interruption the same command goes on",
     )
-    parser.add_argument(
+    _add_layers(parser)
+    _add_parts(parser)
+    shared.add_machine(parser)
+    parser.set_defaults(command=_run)
+
+
+def _add_layers(parser) -> None:
+    group = parser.add_argument_group("layers and pictures")
+    group.add_argument(
+        "--aov",
+        metavar="NAMES",
+        help="layers that describe the surfaces in sight, with commas between: "
+        + ", ".join(channels.AOVS),
+    )
+    group.add_argument(
         "--light-groups",
         metavar="NAME=PATTERN,...",
         help="write the light of groups of lamps to layers, by the ids of emitters or shapes: "
         "key=lamp_*,windows=facade (the others are the group rest); see manylights mix",
     )
-    _add_parts(parser)
-    _add_workers(parser)
-    shared.add_machine(parser)
-    parser.set_defaults(command=_run)
+    group.add_argument(
+        "--denoise",
+        action="store_true",
+        help="add layers denoised.* by Open Image Denoise and show them in the PNG; implies "
+        "--aov albedo,normal,emission (needs manylights[denoise])",
+    )
+    group.add_argument(
+        "--exposure",
+        type=shared.stops,
+        default=0.0,
+        metavar="EV",
+        help="stops by which the PNG is brighter (default: 0)",
+    )
+    group.add_argument(
+        "--tev",
+        nargs="?",
+        const="",
+        metavar="HOST:PORT",
+        help=f"show the picture after each step in tev (default: {live.HOST}:{live.PORT}; needs "
+        "manylights[tev])",
+    )
 
 
-def _add_workers(parser) -> None:
-    parser.add_argument(
+def _add_workers(group) -> None:
+    group.add_argument(
         "--workers",
         metavar="ADDRESS",
         help="render with workers of Dask: local:N, tcp://HOST:PORT, tls://HOST:PORT or "
         "scheduler.json; --threads is for each of them",
     )
-    parser.add_argument(
+    group.add_argument(
         "--ship",
         action="store_true",
         help="with --workers: send them the scene's files (default: they have the same folder)",
@@ -148,6 +185,7 @@ def _add_parts(parser) -> None:
         metavar="FILE",
         help="with --part: take what is learnt from this part or checkpoint of the same render",
     )
+    _add_workers(group)
 
 
 def _add_targets(parser) -> None:
@@ -188,6 +226,13 @@ def _run(options) -> None:
         settings["hide_emitters"] = True
     if options.light_groups is not None:
         settings["light_groups"] = options.light_groups
+    if options.denoise:
+        denoise.check_installed()
+    aovs = denoise.with_guides(options.aov) if options.denoise else options.aov
+    if aovs is not None:
+        settings["aovs"] = channels.aov_list(aovs, "--aov")
+        if options.aov is None:
+            settings["aovs"] = integrators.Wish(settings["aovs"])
     shared.start(options)
     if options.workers is None:
         if options.ship:
@@ -214,6 +259,7 @@ def _load_and_render(options, target: Path, defines, settings, connection=None) 
     if not 0 <= options.sensor < count:
         raise UsageError(f"--sensor {options.sensor}: the scene has {count}, counted from 0")
     names = ("spp", "seed", "sensor", "until_noise", "seconds", "threads")
+    names += ("denoise", "exposure", "tev")
     wanted = {name: getattr(options, name) for name in names}
     wanted |= {"part": _part(options), "learnt": options.learnt}
     if options.checkpoint is not None:

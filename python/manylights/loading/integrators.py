@@ -44,6 +44,10 @@ class Parameter:
         return f"{self.allowed}, default {value_text(self.default) or 'none'}{remark}"
 
 
+class Wish(str):
+    """A value to set on our integrators, which others do without."""
+
+
 BOOLEAN = "true or false"
 HIDE_EMITTERS = Parameter(BOOLEAN, False)
 
@@ -59,10 +63,18 @@ SAMPLING_PARAMETERS = {
     "light_groups": Parameter("text", "", "layers with their light, as key=lamp_*,windows=facade"),
 }
 
+#: Channels that describe the surfaces in sight.
+AOVS = Parameter(
+    "NAME:TYPE between commas with the TYPE albedo, depth, position, uv, geo_normal, sh_normal, "
+    "dp_du, dp_dv, duv_dx, duv_dy, prim_index, shape_index or emission",
+    "none",
+)
+
 #: What each plugin accepts.
 PARAMETERS = {
     DIRECT: {
         **SAMPLING_PARAMETERS,
+        "aovs": AOVS,
         "bsdf_samples": Parameter("integer from 0 to 1024", 1),
         "hide_emitters": HIDE_EMITTERS,
     },
@@ -70,6 +82,7 @@ PARAMETERS = {
         "max_depth": Parameter("integer, -1 for no limit", -1),
         "rr_depth": Parameter("integer >= 1", 5),
         **SAMPLING_PARAMETERS,
+        "aovs": AOVS,
         "hide_emitters": HIDE_EMITTERS,
     },
 }
@@ -90,7 +103,7 @@ REPLACEMENTS = {"direct": DIRECT, "path": VOLPATH, "volpath": VOLPATH}
 #: Parameters, and the integrators in which they mean the same.
 SHARED_PARAMETERS = (
     (("max_depth", "rr_depth"), ("path", "volpath", "volpathmis", VOLPATH)),
-    (tuple(SAMPLING_PARAMETERS), (DIRECT, VOLPATH)),
+    ((*SAMPLING_PARAMETERS, "aovs"), (DIRECT, VOLPATH)),
     (("bsdf_samples",), ("direct", DIRECT)),
     (BASE_PARAMETERS, USING_BLOCKS),
 )
@@ -293,6 +306,12 @@ def _about_media(state, old: str, new: str) -> list[str]:
 
 def _apply(props, settings: dict[str, Any]) -> None:
     plugin = props.plugin_name()
+    if plugin not in PARAMETERS and "aovs" in settings:
+        if isinstance(settings["aovs"], Wish):
+            settings = {name: value for name, value in settings.items() if name != "aovs"}
+        else:
+            known = " or ".join(PARAMETERS)
+            raise UsageError(f"aovs: {plugin} shows no surfaces, {known} do (--integrator NAME)")
     for name, value in settings.items():
         if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
             known = "; ".join(f"{key} ({what})" for key, what in PARAMETERS[plugin].items())

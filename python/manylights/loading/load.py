@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 
 from manylights.errors import UsageError
-from manylights.loading import integrators, light_groups, merging, samplers
+from manylights.loading import integrators, merging, samplers
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
@@ -85,38 +85,39 @@ def load_description(
         return _choose_and_make(parsed, integrator, settings or {}, None)
 
 
-def as_loaded(scene, integrator=None, groups: str | None = None) -> tuple[LoadedScene, object]:
+def as_loaded(scene, integrator=None, added: dict | None = None) -> tuple[LoadedScene, object]:
     """Load whatever describes a scene, if it is not loaded yet.
 
     Args:
         scene: a path, a dictionary, an ``mi.Scene`` or a ``LoadedScene``.
         integrator: ``None``, ``"keep"``, a plugin's name, a dictionary or an ``mi.Integrator``.
-        groups: of lights, as the parameter ``light_groups``. Default: none.
+        added: parameters to set on the integrator, too. Default: none.
 
     Returns:
         The scene, and the integrator to use in place of the scene's, ``None`` for the scene's.
 
     Raises:
-        UsageError: either is something else, or is an object that cannot be given ``groups``.
+        UsageError: either is something else, or there are parameters for what is made already.
     """
-    objects = isinstance(scene, (mi.Scene, LoadedScene)) or isinstance(integrator, mi.Integrator)
-    if groups is not None and objects:
-        raise UsageError(
-            "light_groups: scene and integrator must be descriptions; an object is made with its "
-            "own parameter light_groups"
-        )
     if not (integrator is None or isinstance(integrator, (str, dict, mi.Integrator))):
         raise UsageError(
             f"integrator {integrator!r}: must be a name, a dictionary or an mi.Integrator"
         )
-    if isinstance(scene, (mi.Scene, LoadedScene)):
+    made = isinstance(scene, (mi.Scene, LoadedScene))
+    strict = [
+        name for name, value in (added or {}).items() if not isinstance(value, integrators.Wish)
+    ]
+    if strict and (made or isinstance(integrator, mi.Integrator)):
+        what = "scene" if made else "integrator"
+        raise UsageError(f"{strict[0]}: the {what} is made already, set the parameter before")
+    if made:
         if isinstance(scene, mi.Scene):
             scene = LoadedScene(scene, 1, [])
         return scene, _integrator(integrator)
     own = integrator if isinstance(integrator, mi.Integrator) else None
     settings = dict(integrator) if isinstance(integrator, dict) else {}
     name = settings.pop("type", None) if settings else ("keep" if own else integrator)
-    settings |= {light_groups.PARAMETER: groups} if groups is not None else {}
+    settings |= {} if own else added or {}
     if isinstance(scene, dict):
         return load_description(scene, name, settings), own
     if isinstance(scene, (str, os.PathLike)):
@@ -140,6 +141,8 @@ def _choose_and_make(
     nodes = parsed.state.nodes
     count = sum(node.type == mi.ObjectType.Integrator for node in nodes)
     notes += _merge_emitters(parsed)
+    # Mitsuba makes one mesh of all that have the same material
+    parsed.config.merge_meshes &= not merging.shows_indices(parsed.state)
     choices = {"integrator": integrator, "set": settings}
     choices |= {"sampler": sampler} if sampler else {}
     scene = instantiate(parsed)

@@ -21,6 +21,7 @@ import numpy as np
 
 from manylights.loading import light_groups
 from manylights.loading.integrators import PARAMETERS, leaf_integrators
+from manylights.output import channels
 
 #: Parameters of shapes that say what the mesh is. Shapes with any other stay as they are.
 GEOMETRY = {
@@ -40,6 +41,7 @@ MESH_PARAMETERS = (
 MESH_CHILDREN = ("bsdf.", "emitter.", "interior_medium.", "exterior_medium.")
 
 Reference = mi.Properties.ResolvedReference
+INTEGRATOR = mi.ObjectType.Integrator
 
 
 class MergedScene(dict):
@@ -145,12 +147,12 @@ def merge_emitters(scene: dict, keep=()) -> MergedScene:
 def merge_parsed(config, state) -> dict[str, list[str]]:
     """Merge the emissive meshes of a parsed scene, in place.
 
-    Nothing is done unless all integrators are ours and no ``aov`` shows which shape a pixel has.
+    Nothing is done unless all integrators are ours and none shows which shape a pixel has.
 
     Returns:
         As ``MergedScene.merged``.
     """
-    if not _all_ours(state) or any(node.props.plugin_name() == "aov" for node in state.nodes):
+    if not _all_ours(state) or shows_indices(state):
         return {}
     _prepare(config, state)
     merging = _Merging(state, ())
@@ -164,6 +166,12 @@ def merge_parsed(config, state) -> dict[str, list[str]]:
     for name, mesh in merging.meshes.items():
         state.root.props[name] = mesh
     return {name: [lamp.id for lamp in lamps] for name, lamps in merging.groups.items()}
+
+
+def shows_indices(state) -> bool:
+    """Does an integrator of a parsed scene show the numbers of shapes or of their parts?"""
+    lists = (node.props.get("aovs", "") for node in state.nodes if node.type == INTEGRATOR)
+    return any(kind in channels.INDEX_TYPES for text in lists for kind in channels.aov_types(text))
 
 
 def _prepare(config, state) -> None:

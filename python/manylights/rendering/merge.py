@@ -5,6 +5,7 @@ The scene is not needed: the files say how the film makes its image of the sums.
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -15,7 +16,8 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.errors import UsageError
-from manylights.output import channels, images, light_groups
+from manylights.output import channels, exr, images, light_groups
+from manylights.output import denoise as denoising
 from manylights.rendering import metadata, state_file
 from manylights.rendering.develop import WEIGHT, develop
 from manylights.rendering.job import FILMS, STATE, differences
@@ -59,7 +61,10 @@ class Merged:
 
 
 def merge(
-    paths: Iterable[str | Path], output: str | Path | None = None, partial: bool = False
+    paths: Iterable[str | Path],
+    output: str | Path | None = None,
+    partial: bool = False,
+    denoise: bool = False,
 ) -> Merged:
     """Add parts of one render, in any order and grouping, or average renders of several seeds.
 
@@ -71,23 +76,27 @@ def merge(
             finished images that differ in the seed and the number of samples alone.
         output: file (.exr) to write the image to, with a PNG beside it. Default: none.
         partial: also if parts are missing: the output keeps the sums then, and can be merged again.
+        denoise: find the image without noise, too, as ``render`` does; with albedo and normals if
+            the files have them. Not of an image that has parts missing.
 
     Raises:
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
             that comes twice, or one that is missing and ``partial`` is not set.
     """
     target = None if output is None else images.check_output(str(output))
+    if denoise:
+        denoising.check_installed()
     paths = [Path(path) for path in paths]
     if not paths:
         raise UsageError("nothing to merge: no files")
     first, bitmap = state_file.read(paths[0], WHAT, "")
     if first.state is None:
-        return _merge_images(first, bitmap, paths[1:], target)
+        return _merge_images(first, bitmap, paths[1:], target, denoise)
     del bitmap
     total = _Parts(first)
     for path in paths[1:]:
         total.add(state_file.read(path, WHAT, "")[0])
-    return total.finish(target, partial)
+    return total.finish(target, partial, denoise)
 
 
 class _Parts:
@@ -149,7 +158,7 @@ class _Parts:
                 words = run.words(self.steps)
                 raise UsageError(f"{words} comes twice: in {path} and in {saved.path}")
 
-    def finish(self, target: Path | None, partial: bool) -> Merged:
+    def finish(self, target: Path | None, partial: bool, denoise: bool) -> Merged:
         """Make the image, and write it or, if parts are missing, the sums."""
         runs = [run for saved in self.files for run in saved.runs]
         missing = gaps(runs, self.steps)
@@ -169,8 +178,8 @@ class _Parts:
             previews, notes = images.write_preview(bitmap, target)
             merged.files = [state_file.write(saved), *previews]
         else:
-            _sign(bitmap, self.facts, [self.facts["seed"]], samples)
-            merged.files, notes = images.write_images(bitmap, target, number=_number(self.facts))
+            own = _signature(self.facts, [self.facts["seed"]], samples)
+            notes = _write(merged, target, {}, own, denoise)
         merged.notes += notes
         return merged
 
@@ -213,41 +222,68 @@ def _developed(saved: Saved, state: State):
     return develop(film, state.total(facts["adjoint"]), facts["exposure"])[1]
 
 
-def _sign(bitmap, facts: dict, seeds: list[int], samples: int) -> None:
-    """Write to an image what a finished render says of itself."""
+def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
+    """Return what a finished render says of itself."""
     own = {name: facts[name] for name in facts if name not in STATE}
-    state_file.sign(bitmap, {**own, "part": "1/1", "seeds": seeds}, samples)
+    return state_file.signature({**own, "part": "1/1", "seeds": seeds}, samples)
 
 
-def _number(facts: dict) -> type:
-    """Return the numbers of a film's channels in files."""
-    return np.float16 if facts["number"] == "float16" else np.float32
+def _write(merged: Merged, target: Path, layers: dict, own: dict, denoise: bool) -> list[str]:
+    """Write the image of finished parts or images; return notes about that."""
+    names, shown = channels.names(merged.bitmap), None
+    if denoise:
+        pixels = np.array(merged.bitmap, copy=False).reshape(*merged.bitmap.size()[::-1], -1)
+        kinds = (*denoising.GUIDES, denoising.EMISSION)
+        guides = [name for name in layers if name.startswith(kinds)]
+        planes = [pixels, *(layers[name][..., np.newaxis] for name in guides)]
+        exposure = float(json.loads(own[exr.OURS + "exposure"]))
+        pixels = np.concatenate(planes, axis=2)
+        shown = denoising.denoised(pixels, [*names, *guides], exposure)
+        layers = layers | channels.color_layers(channels.DENOISED, shown)
+    number = np.float16 if json.loads(own[exr.OURS + "number"]) == "float16" else np.float32
+    merged.files, notes = images.write_images(
+        merged.bitmap, target, layers, own, number, merged.samples, shown
+    )
+    return notes
 
 
-def _merge_images(first: Saved, bitmap, paths: list[Path], target: Path | None) -> Merged:
+def _merge_images(
+    first: Saved, planes: dict, paths: list[Path], target: Path | None, denoise: bool
+) -> Merged:
     """Return the mean of finished images."""
-    facts, seeds = first.facts, list(first.facts["seeds"])
-    names, total = channels.names(bitmap), 0.0
-    samples, count = 0, 1 + len(paths)
-    owners = dict.fromkeys(seeds, first.path)
-    saved = first
+    facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
+    names = [name for name in planes if channels.is_averaged(name)]
+    total = {name: np.zeros(plane.shape) for name, plane in planes.items() if name in names}
+    samples, saved = 0, first
     for path in [None, *paths]:
         if path is not None:
-            saved, bitmap = state_file.read(path, WHAT, "")
-            _check_image(saved, channels.names(bitmap), first, names, owners)
+            saved, planes = state_file.read(path, WHAT, "")
+            found = [name for name in planes if channels.is_averaged(name)]
+            _check_image(saved, found, first, names, owners)
         weight = saved.facts["samples_done"]
-        total = total + np.array(bitmap, np.float64) * weight
+        for name in names:
+            # The variance of a mean: weights are squared
+            power = 2 if name.startswith(channels.VARIANCE) else 1
+            total[name] += planes[name].astype(np.float64) * float(weight) ** power
         samples += weight
-    pixels = (total / samples).astype(np.float32)
-    pixels = pixels.reshape(*pixels.shape[:2], len(names))
-    light_groups.add_up(pixels, names)
-    bitmap = channels.join(names, pixels)
+    means = {
+        name: total[name] / float(samples) ** (2 if name.startswith(channels.VARIANCE) else 1)
+        for name in names
+    }
+    shown = channels.shown(names)
+    layers = {name: means[name].astype(np.float32) for name in names if name not in shown}
+    pixels = np.stack([means[name] for name in shown], axis=-1).astype(np.float32)
+    for index, color in enumerate(shown):
+        groups = light_groups.of_color(layers, color)
+        if groups:
+            pixels[..., index] = light_groups.total([layers[name] for name in groups])
+    bitmap = channels.join(shown, pixels)
+    count = 1 + len(paths)
     text = f"images: the mean of {count}, weighted by samples; their sums are not in the files"
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
-        _sign(bitmap, facts, sorted(owners), samples)
-        merged.files, notes = images.write_images(bitmap, target, number=_number(facts))
-        merged.notes += notes
+        own = _signature(facts, sorted(owners), samples)
+        merged.notes += _write(merged, target, layers, own, denoise)
     return merged
 
 

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from manylights import loading
 from manylights.errors import UsageError
 from manylights.output import channels, images
 from manylights.rendering import checkpoint as checkpoints
 from manylights.rendering import metadata, state_file
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
+from manylights.rendering.extras import Extras
 from manylights.rendering.job import Job, check
 from manylights.rendering.parts import Part
 from manylights.rendering.state import State
@@ -64,6 +64,8 @@ class RenderResult:
         seconds: of rendering, those of interrupted processes, too.
         notes: lines about what was replaced, left out or not reached.
         files: that were written.
+        denoised: the colours without noise, shape (height, width, 3 or 1); None if that was not
+            asked for.
     """
 
     image: np.ndarray
@@ -74,6 +76,7 @@ class RenderResult:
     seconds: float
     notes: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    denoised: np.ndarray | None = None
 
 
 def render(
@@ -94,7 +97,7 @@ def render(
     threads: int | None = None,
     client=None,
     ship: bool = False,
-    light_groups: str | dict[str, str | list[str]] | None = None,
+    **extras: Any,
 ) -> RenderResult:
     """Render a scene: a number of samples, or until an image is good enough or a time is up.
 
@@ -117,31 +120,28 @@ def render(
         output: file (.exr) to write the image to, with a PNG beside it. Default: none.
         checkpoint: file (.exr) of the state, to go on from another time. Removed at the end.
         checkpoint_seconds: at least between two writings of it.
-        part: ``(3, 16)`` renders the third of 16 shares of the steps, with ``output="a.exr"`` to
-            ``a.part-03-of-16.exr``, for ``manylights.merge``. Default: all, without parts.
+        part: ``(3, 16)`` renders a share of the steps, to OUT.part-03-of-16.exr. Default: all.
         learnt: file of another part, to take over what is learnt. Default: learn it anew.
         progress: called now and then, also from other threads. What it raises ends the render.
         threads: CPU threads, 1 or more. Default: all, on workers those that Dask knows of.
         client: ``distributed.Client``, whose workers render the scene of a file. Default: none.
         ship: send them the files? Default: the workers have these at the same path.
-        light_groups: groups of lights by patterns of ids, as ``"key=lamp_*,windows=facade"`` or
-            ``{"key": "lamp_*", "windows": ["facade", "pane_?"]}``: the image gets layers
-            ``RGBA_key.R``, ... with their light, and is the sum of them, bit for bit
-            (``output.light_groups``). All other lights are the group ``rest``. For a scene that is
-            read here, not for objects of Mitsuba. Default: what the integrator says.
+        extras: ``aovs``, ``light_groups``, ``denoise``, ``exposure`` and ``tev``, see
+            ``rendering.extras.Extras``.
 
     Raises:
         UsageError: (a ``ValueError``) impossible values, files of another render, no worker of use.
         RuntimeError: Mitsuba or a worker cannot read or render the scene.
     """
     target = None if output is None else images.check_output(str(output))
-    groups = None if light_groups is None else loading.light_groups.as_text(light_groups)
-    loaded, own = loading.as_loaded(scene, integrator, groups)
+    wanted = Extras.of(extras, part)
+    loaded, own = wanted.load(scene, integrator)
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
-    _work(job, state, store, facts, progress or (lambda _: None), threads, client, ship)
-    return _finished(job, state, store, facts, target)
+    watch = wanted.prepare(job, target)
+    _work(job, state, store, facts, progress or (lambda _: None), watch, threads, client, ship)
+    return _finished(job, state, store, facts, target, wanted)
 
 
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
@@ -155,18 +155,24 @@ def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any]
     return facts, state
 
 
-def _work(job: Job, state: State, store, facts, progress, threads, client, ship) -> None:
+def _work(job: Job, state: State, store, facts, progress, watch, threads, client, ship) -> None:
     """Render what the state does not have, here or with workers."""
     check("threads", threads, threads is None or threads >= 1, "1 or more")
     check("ship", ship, not ship or client is not None, "given with client")
     if client is None:
         with thread_count(threads):
-            run(job, state, store, progress)
+            run(job, state, store, progress, watch=watch)
         return
     from manylights.rendering import workers
 
+    watched = state.history.steps
+
     def report(begun: float, spent: float, lines: list[str]) -> None:
+        nonlocal watched
         progress(replace(_progress(job, state, store, begun, spent), workers=lines))
+        if watch is not None and watched != state.history.steps:
+            watched = state.history.steps
+            watch(state)
 
     workers.run(job, state, store, facts or job.facts(), client, report, threads, ship)
 
@@ -176,18 +182,31 @@ def part_path(target: str | Path, part: Part) -> Path:
     return Path(target).with_suffix(f".{part.name()}.exr")
 
 
-def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -> RenderResult:
+def _finished(
+    job: Job, state: State, store, facts: dict, target: Path | None, wanted: Extras
+) -> RenderResult:
     result = result_of(job, state)
+    wanted.add_denoised(job, result)
     if target is not None and job.part is not None:
         path = part_path(target, job.part)
         Checkpoint(path, job, facts=facts).write(state)
         result.files = [path]
     elif target is not None:
-        state_file.sign(result.bitmap, {**facts, "seeds": [job.seed]}, result.samples)
-        layers = variance_layers(result)
-        attributes = metadata.attributes(job, result, facts["version"])
+        signed = state_file.signature({**facts, "seeds": [job.seed]}, result.samples)
+        layers = {**variance_layers(result)}
+        layers |= channels.color_layers(channels.DENOISED, result.denoised)
+        attributes = signed | metadata.attributes(job, result, facts["version"])
         number = images.number_of(job.film)
-        result.files, notes = images.write_images(result.bitmap, target, layers, attributes, number)
+        result.files, notes = images.write_images(
+            result.bitmap,
+            target,
+            layers,
+            attributes,
+            number,
+            result.samples,
+            result.denoised,
+            wanted.exposure,
+        )
         result.notes += notes
     if store is not None and store.path not in result.files:
         store.remove()
@@ -196,11 +215,7 @@ def _finished(job: Job, state: State, store, facts: dict, target: Path | None) -
 
 def variance_layers(result: RenderResult) -> dict[str, np.ndarray]:
     """Return the channels ``variance.*``, where the variance is known."""
-    if result.variance is None:
-        return {}
-    names = channels.RGB if result.variance.shape[2] == 3 else ("Y",)
-    planes = np.moveaxis(result.variance, 2, 0).astype(np.float32)
-    return {f"variance.{name}": plane for name, plane in zip(names, planes)}
+    return channels.color_layers(channels.VARIANCE, result.variance)
 
 
 def _store(path: str | Path, job: Job, seconds: float) -> Checkpoint:
@@ -219,8 +234,17 @@ def run(
     store: Checkpoint | None,
     progress: Callable[[Progress], None],
     clock: Callable[[], float] = time.perf_counter,
+    watch: Callable[[State], None] | None = None,
 ) -> None:
-    """Render the steps of a job that the state does not have, and add them to it."""
+    """Render the steps of a job that the state does not have, and add them to it.
+
+    Args:
+        job, state: what is rendered.
+        store: keeps the state.
+        progress: called with how far it is.
+        clock: for tests.
+        watch: called with the state after each step; its time does not count.
+    """
     history, driver = state.history, job.driver
 
     def tell(fraction_of_step: float = 0.0, spp: int = 0) -> None:
@@ -249,6 +273,8 @@ def run(
                 state.learnt = driver.learnt()
                 store.keep(state)
             history.seconds += clock() - start
+            if watch is not None:
+                watch(state)
             start = clock()
             tell()
         state.learnt = driver.learnt()

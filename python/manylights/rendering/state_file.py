@@ -18,11 +18,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from manylights.errors import UsageError, one_line
-from manylights.output import channels, exr, images
+from manylights.output import channels, exr
 from manylights.rendering.develop import WEIGHT, picture
 from manylights.rendering.job import FORMAT
 from manylights.rendering.parts import Part, Run
@@ -64,29 +63,26 @@ def write(saved: Saved) -> Path:
     summed = state.channels
     shown = [index for index, name in enumerate(summed) if name != WEIGHT]
     image = picture(state.rough_total(facts["adjoint"]), summed)[..., shown]
-    names, parts = [summed[index] for index in shown], [image]
+    planes = {summed[index]: image[..., at] for at, index in enumerate(shown)}
     for prefix, part in zip(channels.sums(len(state.sums)), _parts(state.sums)):
-        names += [prefix + name for name in summed]
-        parts.append(part)
-    bitmap = channels.join(names, *parts)
+        planes |= {prefix + name: part[..., at] for at, name in enumerate(summed)}
     done = {"history": asdict(state.history), "channels": summed, "shown": saved.shown}
     done |= {"learnt": _packed(state.learnt), "sequences": len(state.sums)}
     done["runs"] = [[run.part.number, run.part.count, run.done] for run in saved.runs]
     done |= {"processors": state.processors, "command": saved.command}
     facts = {**facts, **done, "samples_done": state.history.spp}
     facts["checksum"] = _checksum(facts, state.sums)
-    sign(bitmap, facts, state.history.spp)
-    return images.write_whole(bitmap, saved.path, mi.Bitmap.FileFormat.OpenEXR)
+    return exr.write(saved.path, planes, signature(facts, state.history.spp))
 
 
-def sign(bitmap, facts: dict[str, Any], samples: int) -> None:
-    """Write facts and the number of samples per pixel to the attributes of an image."""
-    for name, value in {**facts, "samples_done": samples}.items():
-        bitmap.metadata()[exr.OURS + name] = json.dumps(value)
+def signature(facts: dict[str, Any], samples: int) -> dict[str, str]:
+    """Return facts and the number of samples per pixel as the attributes of a file."""
+    told = {**facts, "samples_done": samples}
+    return {exr.OURS + name: json.dumps(value) for name, value in told.items()}
 
 
-def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
-    """Read a file of a state or a finished image, and return it and its bitmap.
+def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, dict[str, np.ndarray]]:
+    """Read a file of a state or a finished image, and return it and its channels.
 
     Args:
         path: the file.
@@ -97,14 +93,14 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
         UsageError: not such a file, or not a whole one.
     """
     try:
-        bitmap = channels.read(path)
+        planes, attributes = exr.read(path)
         facts = {
             name[len(exr.OURS) :]: exr.fact(value)
-            for name, value in bitmap.metadata().items()
+            for name, value in attributes.items()
             if name.startswith(exr.OURS)
         }
         if "samples_done" in facts:
-            return _saved(path, bitmap, facts), bitmap
+            return _saved(path, planes, facts), planes
     except (UsageError, ValueError, KeyError, TypeError, AttributeError, zlib.error) as error:
         what = f"{type(error).__name__}: " if isinstance(error, (KeyError, TypeError)) else ""
         text = f"{path}: not a whole {prefix}{remedy} ({what}{one_line(error)})"
@@ -112,7 +108,7 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, Any]:
     raise UsageError(f"{path}: not a {prefix} of manylights{remedy}")
 
 
-def _saved(path: Path, bitmap, facts: dict[str, Any]) -> Saved:
+def _saved(path: Path, planes: dict[str, np.ndarray], facts: dict[str, Any]) -> Saved:
     if facts["format"] != FORMAT:
         version = facts.get("version")
         raise ValueError(f"format {facts['format']} and not {FORMAT}, written by {version}")
@@ -124,7 +120,7 @@ def _saved(path: Path, bitmap, facts: dict[str, Any]) -> Saved:
             raise ValueError(f"{facts['samples_done']} samples of the seeds {facts['seeds']}")
         return Saved(path, facts, [], None, [], [])
     runs = [_run(run, steps) for run in facts["runs"]]
-    state = _state(channels.split(bitmap), facts)
+    state = _state(planes, facts)
     if _checksum(facts, state.sums) != facts["checksum"]:
         raise ValueError("checksum")
     command = [str(word) for word in facts["command"]]

@@ -152,12 +152,12 @@ def _read(scene: Scene, name: str) -> dict[str, np.ndarray]:
     path: Path = scene.folder / name
     if not path.exists():
         raise UsageError(f"{path}: no such file, though results.json says that it was rendered")
-    bitmap = channels.read(path)
-    width, height = bitmap.size()
+    planes = channels.read(path)
+    height, width = next(iter(planes.values())).shape
     if (height, width) != (scene.height, scene.width):
         size = f"{width} x {height}"
         raise UsageError(f"{path}: {size} pixels instead of {scene.width} x {scene.height}")
-    return channels.split(bitmap)
+    return planes
 
 
 def _exposure(reference: np.ndarray) -> float:

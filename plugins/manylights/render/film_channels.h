@@ -1,0 +1,36 @@
+#pragma once
+
+/**
+ * The channels that an integrator adds to those of the film, in their order: counts, what
+ * describes the surfaces, and the light of groups.
+ */
+
+#include "aov_list.h"
+#include "manylights/choice/parameters.h"
+
+namespace manylights {
+
+struct FilmChannels {
+    std::vector<std::string> names;
+    /// Where the surfaces' begin, and the groups'
+    size_t aovs, groups;
+
+    FilmChannels(const SamplingParameters &params, const std::vector<Aov> &list)
+        : names(count_channels(params)) {
+        aovs   = names.size();
+        groups = append(channel_names(list));
+        append(group_channels(params.light_groups));
+    }
+
+    /// How many describe the surfaces
+    size_t aov_count() const { return groups - aovs; }
+
+private:
+    /// Returns the number of all
+    size_t append(const std::vector<std::string> &more) {
+        names.insert(names.end(), more.begin(), more.end());
+        return names.size();
+    }
+};
+
+} // namespace manylights
