@@ -193,3 +193,45 @@ def test_spectral_lines_are_sampled(variant, kind):
     tools.assert_same_mean(*images[::-1], bias=0.3, power_channels=[1], label=kind)
     lights = mi.traverse(integrator)["lights_in_tree"]
     assert lights == (24 if kind == "mesh" else 12)
+
+
+def lamp(kind):
+    """A light of each kind that shines down from a height of 30, at most .01 wide."""
+    down = transform().look_at([0, 0, 30], [0, 0, 0], [1, 0, 0])
+    small = transform().translate([0, 0, 30]).scale(0.005)
+    return {
+        "point": lambda: {"type": "point", "position": [0, 0, 30], "intensity": rgb(RADIANCE)},
+        "spot": lambda: {"type": "spot", "to_world": down, "intensity": rgb(RADIANCE)},
+        "projector": lambda: {"type": "projector", "to_world": down, "irradiance": 1.0},
+        "rectangle": lambda: emitter(type="rectangle", to_world=down.scale(0.005)),
+        "disk": lambda: emitter(type="disk", to_world=down.scale(0.005)),
+        "cube": lambda: emitter(type="cube", to_world=small),
+        "sphere": lambda: emitter(type="sphere", center=[0, 0, 30], radius=0.005),
+        "cylinder": lambda: emitter(
+            type="cylinder", p0=[0, -0.005, 30], p1=[0, 0.005, 30], radius=0.005
+        ),
+        "textured": lambda: {
+            "type": "rectangle",
+            "to_world": down.scale(0.005),
+            "emitter": {"type": "area", "radiance": {"type": "checkerboard"}},
+        },
+    }[kind]()
+
+
+KINDS = ["point", "spot", "projector", "rectangle", "disk", "cube", "sphere", "cylinder"]
+
+
+@VARIANTS
+@pytest.mark.parametrize("integrator", [DIRECT, PATHS], ids=["direct", "volpath"])
+@pytest.mark.parametrize("kind", [*KINDS, "textured"])
+def test_far_lamp_does_not_shine_through_its_shade(variant, kind, integrator):
+    """A shade .02 below the lamp, which is less than a thousandth of the distance."""
+    shade = {
+        "type": "rectangle",
+        "to_world": transform().translate([0, 0, 29.98]).scale(0.1),
+        "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": rgb([0, 0, 0])}},
+    }
+    settings = {"scene": patch(lamp=lamp(kind), shade=shade), "integrator": integrator, "spp": 4}
+    assert_irradiance(**settings, exact=0, label=kind)
+    lit = mi.render(mi.load_dict(patch(lamp=lamp(kind))), integrator=mi.load_dict(integrator))
+    assert np.mean(lit) > 0

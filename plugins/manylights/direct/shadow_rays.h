@@ -241,7 +241,8 @@ private:
     Spectrum visible(const Vertex &vertex, const Sample &sample, Rng &rng,
                      Mask active) const {
         if (!vertex.inside) {
-            Mask occluded = m_scene->ray_test(vertex.si.spawn_ray_to(sample.p), active);
+            Mask occluded = m_scene->ray_test(
+                shadow_ray<Float, Spectrum>(vertex.si, sample.p), active);
             return sample.unoccluded() & (active && !occluded);
         }
         Interaction3f origin = vertex.origin();

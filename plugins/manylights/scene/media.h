@@ -11,6 +11,7 @@
 
 #include "collisions.h"
 #include "manylights/base/loop.h"
+#include "shadow_ray.h"
 #include <drjit/random.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/medium.h>
@@ -121,8 +122,8 @@ public:
         };
         Float distance = dr::norm(to - from.p);
         Vector3f d     = (to - from.p) / distance;
-        State state{ active, from.spawn_ray_to(to), Float(0.f),
-                     medium, Spectrum(1.f),         std::move(rng) };
+        State state{ active, shadow_ray(from, to), Float(0.f),
+                     medium, Spectrum(1.f),        std::move(rng) };
         loop(
             state, [](const State &s) { return s.active; },
             [&](State &s) {
@@ -148,7 +149,7 @@ public:
                 s.active &= passes;
                 if (dr::none_or<false>(s.active))
                     return;
-                cross(s, si, pi.t);
+                cross(s, si);
             },
             "Media: transmittance");
         rng = std::move(state.rng);
@@ -249,18 +250,18 @@ private:
         return passes;
     }
 
-    /// Pass the surface that a shadow ray has reached after the distance t
-    template <typename State>
-    void cross(State &s, const SurfaceInteraction3f &si, const Float &t) const {
+    /// Pass the surface that a shadow ray has reached
+    template <typename State> void cross(State &s, const SurfaceInteraction3f &si) const {
         BSDFPtr bsdf                   = si.bsdf();
         Spectrum value                 = bsdf->eval_null_transmission(si, s.active);
         value                          = si.to_world_mueller(value, si.wi, si.wi);
         dr::masked(s.result, s.active) = s.result * value;
-        Float left                     = s.ray.maxt - t;
         Ray3f next                     = si.spawn_ray(s.ray.d);
-        next.maxt                      = left;
-        dr::masked(s.ray, s.active)    = next;
-        s.medium                       = medium_beyond(si, s.medium, s.ray.d, s.active);
+        // It starts a little off the surface, and ends where the whole ray does
+        Float left                  = s.ray.maxt - dr::dot(next.o - s.ray.o, s.ray.d);
+        next.maxt                   = left;
+        dr::masked(s.ray, s.active) = next;
+        s.medium                    = medium_beyond(si, s.medium, s.ray.d, s.active);
         s.active &= left > 0.f && dr::any(mitsuba::unpolarized_spectrum(s.result) != 0.f);
     }
 
