@@ -140,10 +140,10 @@ lights there are. **It works less well**
 rendered first: their first samples, :math:`2^{17}` in all if there are as many. For each cell of
 space and each node of the tree their shadow rays are counted: those that were traced to lights
 below each of its children, and the share :math:`v` of them that arrived. All other samples weight
-:math:`h`, :math:`H` and :math:`g` by :math:`\sqrt{v}`, or by a floor that falls from 0.1 to 0.02
+:math:`h`, :math:`H` and :math:`g` by :math:`\sqrt{v}`, or by a floor that falls from 0.05 to 0.02
 with the number of rays; if nothing is hidden, they are rendered as usual. All samples count in the
-image, which stays unbiased, and the same seed gives the same bits. The table takes at most 38 MB.
-Nothing is learnt from images with fewer than :math:`2^{19}` samples in LLVM variants or
+image, which stays unbiased, and the same seed gives the same bits. The table takes at most 42 MB.
+Nothing is learnt from images with fewer than :math:`2^{16}` samples in LLVM variants or
 :math:`2^{23}` in CUDA variants, where another pass costs more than it gains, where all lights are
 considered anyway, and while differentiating; an integrator that is nested in others which only ask
 it for samples uses what it has kept, and learns nothing. What was kept is dropped with the

@@ -8,7 +8,7 @@
  * v of rays that arrive, the weights of children in the tree, H and the targets of stage 3
  * get the factor
  *
- *     f = max(sqrt(v), floor),    floor = .8 / sqrt(n), but .02 to .1, after n rays.
+ *     f = max(sqrt(v), floor),    floor = .2 / sqrt(n), but .02 to .05, after n rays.
  *
  * The root is due to the visibility V being 0 or 1: the best density is sqrt(E[(F V)^2]) =
  * F sqrt(v). A factor is fixed before the number that it steers is drawn, so the image is
@@ -28,7 +28,10 @@
 namespace manylights {
 
 /// Smallest factor: bounds what a wrong record can do, and falls with the number of its rays
-constexpr float kFloorOfFew = .1f, kFloorOfMany = .02f, kFloorFall = .8f;
+constexpr float kFloorOfFew = .05f, kFloorOfMany = .02f, kFloorFall = .2f;
+
+/// Rays that a node is assumed to have had, of which the share arrived that is known of its parent
+constexpr float kRaysOfParent = 16.f;
 
 /// Cells are cubes with a side of so much of the distance from the camera, rounded down to a
 /// power of two
@@ -90,10 +93,10 @@ public:
         : m_records(records), m_camera(size.camera[0], size.camera[1], size.camera[2]),
           m_scene(size.scene), m_counting(true), m_factors(dr::zeros<Storage>(records)) {
         if constexpr (dr::is_jit_v<Float>) {
-            m_counts = dr::zeros<UInt32>(records * kCounts);
+            m_counts = dr::zeros<UInt32>(count_size());
             dr::make_opaque(m_camera, m_scene, m_counting, m_factors, m_counts);
         } else {
-            m_counts = Counts(records * kCounts);
+            m_counts = Counts(count_size());
         }
     }
 
@@ -129,12 +132,19 @@ public:
     /// A ray to a light below a child of a node was traced
     void count(const UInt32 &cell, const UInt32 &node, const UInt32 &slot,
                const Mask &arrived, const Mask &active) const {
-        UInt32 index = record(cell, node) * kCounts + 2u * slot +
+        UInt32 place = record(cell, node),
+               index = place * kCounts + 2u * slot +
                        dr::select(arrived, UInt32(1), UInt32(0));
-        if constexpr (dr::is_jit_v<Float>)
+        if constexpr (dr::is_jit_v<Float>) {
             dr::scatter_add(m_counts, UInt32(1), index, active);
-        else if (active)
+            dr::scatter_reduce(ReduceOp::Max, m_counts, cell, cell_index(place), active);
+        } else if (active) {
             m_counts[index].fetch_add(1, std::memory_order_relaxed);
+            auto &known     = m_counts[cell_index(place)];
+            uint32_t before = known.load(std::memory_order_relaxed);
+            while (before < cell && !known.compare_exchange_weak(before, cell))
+                ;
+        }
     }
 
     /**
@@ -149,20 +159,18 @@ public:
         if (records <= m_records)
             return;
         if constexpr (dr::is_jit_v<Float>) {
-            auto repeat = [&](const UInt32 &array, uint32_t width) {
-                UInt32 index = dr::arange<UInt32>(records * width);
-                return dr::gather<UInt32>(array, index & (m_records * width - 1u));
-            };
-            m_factors = repeat(m_factors, 1);
-            m_counts  = repeat(m_counts, kCounts);
+            UInt32 factor = dr::arange<UInt32>(records),
+                   count  = dr::arange<UInt32>(records * (kCounts + 1));
+            m_factors     = dr::gather<UInt32>(m_factors, factor & (m_records - 1u));
+            m_counts      = dr::gather<UInt32>(m_counts, before_growth(count, records));
             dr::make_opaque(m_factors, m_counts);
         } else {
             Storage factors = dr::empty<Storage>(records);
-            Counts counts(records * kCounts);
-            for (size_t i = 0; i < records; ++i)
+            Counts counts((size_t) records * (kCounts + 1));
+            for (uint32_t i = 0; i < records; ++i)
                 factors.data()[i] = m_factors.data()[i & (m_records - 1)];
-            for (size_t i = 0; i < counts.size(); ++i)
-                counts[i] = m_counts[i & (m_records * kCounts - 1)].load();
+            for (uint32_t i = 0; i < counts.size(); ++i)
+                counts[i] = m_counts[before_growth(i, records)].load();
             m_factors = std::move(factors);
             m_counts  = std::move(counts);
         }
@@ -170,7 +178,7 @@ public:
     }
 
     /// What was counted: for each record and child the rays that were blocked and those that
-    /// arrived
+    /// arrived; then the cell of each record
     Storage counts() const {
         if constexpr (dr::is_jit_v<Float>) {
             return m_counts;
@@ -182,7 +190,7 @@ public:
         }
     }
 
-    size_t count_size() const { return (size_t) m_records * kCounts; }
+    size_t count_size() const { return (size_t) m_records * (kCounts + 1); }
 
     /// Go on from what was counted elsewhere, in a table of the same size
     void set_counts(const Storage &counts) {
@@ -203,23 +211,22 @@ public:
      * Make factors of the counts. Returns what they promise: with rays in proportion to F, the
      * variance of choosing a child is in proportion to sum(n v) sum(n), and (sum(n sqrt(v)))^2
      * if the choice knows v. The result is the mean logarithm of the ratio over the rays.
+     *
+     * @param nodes        how many the tree has
+     * @param parent_link  of a node: 4 * parent + slot, kNone for the root
      */
-    float learn() {
+    template <typename ParentLink>
+    float learn(uint32_t nodes, const ParentLink &parent_link) {
         if constexpr (dr::is_jit_v<Float>) {
-            using Record  = dr::Array<UInt32, kCounts>;
-            Record counts = dr::gather<Record>(m_counts, dr::arange<UInt32>(m_records));
-            Summary all   = summarize([&](size_t i) { return Float(counts.entry(i)); });
+            Summary all = summarize(dr::arange<UInt32>(m_records), nodes, parent_link);
             Float rays = dr::sum(all.rays), gain = dr::sum(all.gain);
             m_factors = all.word;
             dr::eval(m_factors, rays, gain);
             return gain[0] / std::max(rays[0], 1.f);
         } else {
             double rays = 0, gain = 0;
-            for (size_t r = 0; r < m_records; ++r) {
-                Summary record = summarize([&](size_t i) {
-                    return (float) m_counts[r * kCounts + i].load(
-                        std::memory_order_relaxed);
-                });
+            for (uint32_t r = 0; r < m_records; ++r) {
+                Summary record = summarize(r, nodes, parent_link);
                 rays += record.rays;
                 gain += record.gain;
                 m_factors.data()[r] = record.word;
@@ -263,14 +270,78 @@ private:
         Float rays, gain;
     };
 
-    /// At first one ray that arrives is assumed
-    template <typename Read> static Summary summarize(const Read &read) {
-        Float arrived = (read(1) + read(3)) + (read(5) + read(7)),
-              rays    = arrived + (read(0) + read(2)) + (read(4) + read(6)),
-              all     = (arrived + 1.f) / (rays + 1.f), sum_v(0.f), sum_root(0.f);
+    /// Where the cell of a record is kept: the largest of those that share it, 0 if it is empty
+    UInt32 cell_index(const UInt32 &record) const { return m_records * kCounts + record; }
+
+    /// Where a number of more `records` comes from
+    UInt32 before_growth(const UInt32 &index, uint32_t records) const {
+        return dr::select(index < records * kCounts, index & (m_records * kCounts - 1u),
+                          cell_index(index & (m_records - 1u)));
+    }
+
+    dr::Array<Float, kCounts> read(const UInt32 &record, const Mask &active) const {
+        using Record = dr::Array<UInt32, kCounts>;
+        if constexpr (dr::is_jit_v<Float>) {
+            return dr::Array<Float, kCounts>(
+                dr::gather<Record>(m_counts, record, active));
+        } else {
+            Record result;
+            for (uint32_t i = 0; i < kCounts; ++i)
+                result.entry(i) =
+                    m_counts[record * kCounts + i].load(std::memory_order_relaxed);
+            return dr::Array<Float, kCounts>(result);
+        }
+    }
+
+    /// Rays of a record that arrived, and all of them
+    static std::pair<Float, Float> rays_of(const dr::Array<Float, kCounts> &counts) {
+        Float arrived = (counts[1] + counts[3]) + (counts[5] + counts[7]);
+        return { arrived, arrived + (counts[0] + counts[2]) + (counts[4] + counts[6]) };
+    }
+
+    /// The share of the rays below a node that arrive; what is known of its parent counts as
+    /// kRaysOfParent rays, and above the root all arrive
+    template <typename ParentLink>
+    Float arriving(const UInt32 &record, uint32_t nodes, const ParentLink &parent_link,
+                   const Mask &active) const {
+        struct State {
+            UInt32 node;
+            Float share, weight;
+            Mask active;
+            DRJIT_STRUCT(State, node, share, weight, active)
+        };
+        UInt32 cell;
+        if constexpr (dr::is_jit_v<Float>)
+            cell = dr::gather<UInt32>(m_counts, cell_index(record), active);
+        else
+            cell = m_counts[cell_index(record)].load(std::memory_order_relaxed);
+        State state{ (record - cell) & (m_records - 1u), Float(0.f), Float(1.f), active };
+        state.active &= state.node < nodes;
+        loop(
+            state, [](const State &s) { return s.active; },
+            [&](State &s) {
+                auto [arrived, rays] =
+                    rays_of(read((cell + s.node) & (m_records - 1u), s.active));
+                s.share = dr::fmadd(s.weight, arrived / (rays + kRaysOfParent), s.share);
+                s.weight *= kRaysOfParent / (rays + kRaysOfParent);
+                UInt32 link = parent_link(s.node);
+                s.active &= link != kNone;
+                s.node = dr::select(s.active, link >> 2u, s.node);
+            },
+            "Visibility: parents");
+        return state.share + state.weight;
+    }
+
+    template <typename ParentLink>
+    Summary summarize(const UInt32 &record, uint32_t nodes,
+                      const ParentLink &parent_link) const {
+        auto counts = read(record, Mask(true));
+        Float rays  = rays_of(counts).second, sum_v(0.f), sum_root(0.f);
+        Mask known  = rays > 0.f;
+        Float all   = arriving(record, nodes, parent_link, known);
         UInt32 word(0);
         for (uint32_t c = 0; c < 4; ++c) {
-            Float hits = read(2 * c + 1), n = hits + read(2 * c),
+            Float hits = counts[2 * c + 1], n = hits + counts[2 * c],
                   v    = dr::fmadd(all, kPriorRays, hits) / (n + kPriorRays),
                   root = dr::sqrt(v);
             sum_v += n * v;
@@ -279,7 +350,6 @@ private:
                 root, dr::clip(kFloorFall * dr::rsqrt(n), kFloorOfMany, kFloorOfFew));
             word |= UInt32(dr::fmadd(f, 255.f, .5f)) << (8u * c);
         }
-        auto known = rays > 0.f;
         Float gain = rays * dr::log(sum_v * rays / dr::square(sum_root));
         return { dr::select(known, word, UInt32(0)), rays, dr::select(known, gain, 0.f) };
     }

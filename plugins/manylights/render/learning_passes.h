@@ -104,7 +104,7 @@ public:
     void end_pass(const PlannedPass &pass, Film *film, size_t first_layer) {
         if (!m_lights || pass.role != Role::Train)
             return;
-        m_lights->change_learner([](auto &learner) { learner.learn(); });
+        m_lights->change_learner([&](auto &learner) { learner.learn(m_lights->tree()); });
         if (m_lights->groups().count() > 0)
             m_lights->set_group_levels(group_levels<Float, Spectrum>(
                 film, first_layer, m_lights->groups().count()));
@@ -125,7 +125,7 @@ private:
 
     /// With fewer samples, recording one more pass takes longer than it may gain
     static constexpr double kLeastTotal =
-        dr::is_cuda_v<Float> ? 0x1p23 : (dr::is_llvm_v<Float> ? 0x1p19 : 0);
+        dr::is_cuda_v<Float> ? 0x1p23 : (dr::is_llvm_v<Float> ? 0x1p16 : 0);
 
     /// Go on from what the user has written
     void write_counts() {
@@ -141,7 +141,8 @@ private:
         const uint32_t *begin = numbers.data();
         m_lights->set_group_levels({ begin + rays, begin + size });
         m_lights->change_learner([&](auto &learner) {
-            learner.set_counts(size == rays ? LearnerCounts(dr::detach<false>(m_counts))
+            learner.set_counts(m_lights->tree(),
+                               size == rays ? LearnerCounts(dr::detach<false>(m_counts))
                                             : dr::load<LearnerCounts>(begin, rays));
         });
     }

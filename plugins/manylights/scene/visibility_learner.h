@@ -22,7 +22,7 @@ public:
     /**
      * Learn from now on: anew, or in addition to what was kept if the shapes are still the same.
      * The table has 512 records for each of `nodes`, about as many as there are cells in sight,
-     * but no more than `samples` are expected, and at most 38 MB.
+     * but no more than `samples` are expected, and at most 42 MB.
      */
     void start(const Scene *scene, const CellSize &size, uint32_t nodes, double samples,
                bool keep) {
@@ -52,15 +52,19 @@ public:
     }
 
     /// Make factors of the counts
-    void learn() { m_worth_it = m_table->learn() >= kLeastGain; }
+    template <typename Tree> void learn(const Tree &tree) {
+        float gain = m_table->learn(
+            tree.node_count(), [&](const auto &node) { return tree.parent_link(node); });
+        m_worth_it = gain >= kLeastGain;
+    }
 
     /// What was counted, empty if there is no table
     Counts counts() const { return m_table ? m_table->counts() : Counts(); }
     /// How many numbers they are
     size_t count_size() const { return m_table ? m_table->count_size() : 0; }
-    void set_counts(const Counts &counts) {
+    template <typename Tree> void set_counts(const Tree &tree, const Counts &counts) {
         m_table->set_counts(counts);
-        learn();
+        learn(tree);
     }
 
     void stop(bool keep) {

@@ -100,6 +100,9 @@ template <typename Float> struct TreeView {
             return dr::load<dr::Array<Float, Count>>(buffer.data() + index * Count);
     }
 
+    /// How many wide nodes there are
+    uint32_t node_count() const { return (uint32_t) dr::width(node_links); }
+
     UInt32 parent_link(const UInt32 &node) const {
         if constexpr (dr::is_jit_v<Float>)
             return dr::gather<UInt32>(node_links, node);

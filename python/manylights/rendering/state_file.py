@@ -29,7 +29,7 @@ from manylights.rendering.state import State
 from manylights.rendering.sums import PARTS, Sums
 from manylights.rendering.targets import History
 
-#: What is learnt has 38 MB at most; more is no file of ours.
+#: What is learnt has 42 MB at most; more is no file of ours.
 MOST_LEARNT = 2**26
 
 #: More steps take longer than anybody waits.
