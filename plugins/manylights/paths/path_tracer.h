@@ -14,6 +14,7 @@
 
 #include "manylights/direct/direct_light.h"
 #include "manylights/scene/hidden_emitters.h"
+#include "manylights/scene/lamps_in_view.h"
 #include "scattering.h"
 
 namespace manylights {
@@ -29,11 +30,15 @@ public:
     using Piece       = manylights::Piece<Float, Spectrum>;
     using Direction   = manylights::Direction<Float, Spectrum>;
     using FloatD      = dr::detached_t<Float>;
+    using Lamps       = LampsInView<Float, Spectrum>;
 
+    /// @param lamps  that are put on the film otherwise, too; may be null
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
-               const SamplingParameters &params, const PathLimits &limits)
+               const SamplingParameters &params, const PathLimits &limits,
+               const Lamps *lamps)
         : m_scene(scene), m_direct(scene, lights, params, media), m_limits(limits),
-          m_media(media.any), m_segments(media.homogeneous && media.scattering),
+          m_lamps(lamps), m_media(media.any),
+          m_segments(media.homogeneous && media.scattering),
           m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr),
           m_flights(m_direct.media(), m_limits, m_segments),
           m_scattering(m_limits, m_segments) {}
@@ -127,8 +132,15 @@ private:
         Spectrum radiance = emission.emitted(si, light, active);
         Float light_pdf = m_direct.hit_density(s.from, s.u_tree, plain(s.depth == 1u), si,
                                                light, active && !s.specular);
-        Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
-        add(s, radiance * dr::detach(weight), piece, active);
+        Float weight   = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
+        Spectrum value = seen(s, radiance * dr::detach(weight), piece);
+        if (m_lamps) {
+            Mask first = active && s.depth == 0u;
+            value      = weigh_lamp<Float>(
+                value,
+                dr::select(first, m_lamps->weight(si, s.ray.d, light, first), 1.f));
+        }
+        dr::masked(s.result, active) = s.result + value;
         s.valid |= active && light != kNone && !s.ended;
     }
 
@@ -166,10 +178,15 @@ private:
 
     /// Add radiance of the vertex at the end of a piece
     void add(State &s, const Spectrum &radiance, const Piece &piece, Mask active) const {
+        dr::masked(s.result, active) = s.result + seen(s, radiance, piece);
+    }
+
+    /// What the camera sees of it
+    Spectrum seen(const State &s, const Spectrum &radiance, const Piece &piece) const {
         Spectrum value = s.throughput * radiance;
         if (m_media)
             value *= piece.seen;
-        dr::masked(s.result, active) = s.result + value;
+        return value;
     }
 
     // ----------------------------------------------------------------------- Scattering
@@ -272,6 +289,7 @@ private:
     const Scene *m_scene;
     DirectLight m_direct;
     PathLimits m_limits;
+    const Lamps *m_lamps;
     /// Are there media, and those whose single scattering is estimated along whole segments?
     /// Can a path find light by chance?
     bool m_media, m_segments, m_sees_lights;
