@@ -110,9 +110,11 @@ CameraView<float> read_view(const mitsuba::Sensor<Float, Spectrum> *sensor) {
         return value ? read_scalar(*value) : 0.f;
     };
     CameraView<float> view;
-    auto to_world   = sensor->world_transform();
-    auto projection = camera->projection_transform();
-    auto size = sensor->film()->size(), crop = sensor->film()->crop_size();
+    auto to_world = sensor->world_transform();
+    auto size     = sensor->film()->size();
+    auto offset   = sensor->film()->crop_offset();
+    // Mitsuba's projection is not evaluated: reading it would take kernels
+    float tangent = std::tan(.5f * dr::deg_to_rad(number("x_fov")));
     for (size_t i = 0; i < 3; ++i) {
         view.position.entry(i) = read_scalar(to_world.matrix.entry(i, 3));
         for (size_t j = 0; j < 3; ++j)
@@ -120,11 +122,9 @@ CameraView<float> read_view(const mitsuba::Sensor<Float, Spectrum> *sensor) {
     }
     const char *offsets[] = { "principal_point_offset_x", "principal_point_offset_y" };
     for (size_t i = 0; i < 2; ++i) {
-        view.scale.entry(i) =
-            read_scalar(projection.matrix.entry(i, i)) * (float) crop[i];
+        view.scale.entry(i) = -.5f * (float) size.x() / tangent;
         view.shift.entry(i) =
-            read_scalar(projection.matrix.entry(i, 2)) * (float) crop[i] -
-            (float) size[i] * number(offsets[i]);
+            (float) size[i] * (.5f - number(offsets[i])) - (float) offset[i];
     }
     view.lens          = sensor->class_name() == "ThinLensCamera";
     view.radius        = view.lens ? number("aperture_radius") : 0.f;

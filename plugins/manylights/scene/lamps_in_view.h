@@ -33,15 +33,15 @@ struct LampImage {
      */
     static LampImage of(const LightRow &row, const CameraView<float> &camera,
                         const mitsuba::Vector<uint32_t, 2> &size, uint32_t border) {
-        float diameter = light_diameter(row);
-        if (!(diameter > 0))
-            return {};
         auto seen   = with_kind(kind_of(row), [&](auto light) {
             return light.appearance(Row<float>{ row.geometry }, camera.position, 0.f);
         });
         auto center = camera.position + seen.w;
         float depth = camera.depth(center);
-        if (!(depth - diameter > camera.near_clip && depth < camera.far_clip))
+        if (!(seen.intensity > 0 && depth > camera.near_clip && depth < camera.far_clip))
+            return {};
+        float diameter = light_diameter(row);
+        if (!(diameter > 0 && depth - diameter > camera.near_clip))
             return {};
         float density = camera.pixels() / (depth * depth),
               covered = density * seen.intensity * dr::norm(seen.w) / depth,
@@ -89,7 +89,7 @@ public:
         m_others = kOthers * light / pixels;
         if (sum() <= kMostPoints * pixels)
             return;
-        for (double step = .5; step > 1e-6; step *= .5)
+        for (double step = .5; step > 1e-3; step *= .5)
             m_scale += sum() > kMostPoints * pixels ? -step : step;
     }
 
