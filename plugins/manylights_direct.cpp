@@ -159,6 +159,14 @@ variants, and shows of instances the instance. Indices are averaged like all els
 has several. :code:`emission` is the radiance of the lamp or environment in sight, without the
 media between. Films with bands of their own (:monosp:`specfilm`) take no further channels.
 
+**Lamps in the picture.** A lamp that covers a hundredth of a pixel is found by one of a hundred
+camera rays. Emissive triangles, spheres, disks and cylinders that cover less than a quarter of the
+pixels that their image touches are therefore sampled from their side, too, and what a perspective
+or thin lens camera sees of their points is put on the film, weighted against camera rays by the
+balance heuristic. There is at most one point for ten camera rays, most of them on lamps that are
+bright for what they cover; lamps that are large, out of sight or seen in mirrors are left to rays.
+This is part of rendering: integrators that nest this one, and gradients, have camera rays alone.
+
 **Parts of a job.** A rendering that is not made by one call follows a plan, the entry
 :code:`plan` of :code:`mi.traverse(integrator)`: four numbers for each pass, its first sample, the
 number of samples of each pixel, its role (0: all pixels; 1: those that train; 2: the others) and a
@@ -213,7 +221,8 @@ using DirectBase = manylights::LightIntegrator<Float, Spectrum, SamplingIntegrat
 template <typename Float, typename Spectrum>
 class ManyLightsDirect final : public DirectBase<Float, Spectrum> {
 public:
-    MI_IMPORT_BASE(DirectBase, m_hide_emitters, m_params, m_cache, no_light, write_layers)
+    MI_IMPORT_BASE(DirectBase, m_hide_emitters, m_params, m_cache, m_lamps, no_light,
+                   write_layers)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium, BSDF, BSDFPtr)
     using DirectLight = manylights::DirectLight<Float, Spectrum>;
     using GroupLight  = manylights::GroupLight<Float, Spectrum>;
@@ -253,9 +262,13 @@ public:
         SurfaceInteraction3f si =
             pi.compute_surface_interaction(ray, +RayFlags::All, active);
         Spectrum result(0.f);
-        if (!m_hide_emitters)
-            result = direct.emission().emitted(si, direct.emission().light_at(si, active),
-                                               active);
+        if (!m_hide_emitters) {
+            auto light = direct.emission().light_at(si, active);
+            result     = direct.emission().emitted(si, light, active);
+            if (m_lamps)
+                result = manylights::weigh_lamp<Float>(
+                    result, m_lamps->weight(si, ray.d, light, active));
+        }
 
         GroupLight light(groups);
         if (light.is_wanted()) {

@@ -127,6 +127,9 @@ Transmittance of shadow rays is exact in homogeneous media, and ratio-tracked in
 ones. Where the extinction varies between colour channels, distances have the mean of their
 densities: no weight exceeds the number of channels.
 
+**Lamps in the picture** that are small on the film are sampled from their side, too, as by
+:monosp:`manylights_direct`: through media, and through surfaces that let light pass straight on.
+
 **It works well** where direct light matters: many lights on surfaces and in fog, few bounces.
 **It works less well**
 
@@ -166,8 +169,9 @@ template <typename Float, typename Spectrum>
 class ManyLightsVolpath final : public PathBase<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(PathBase, m_max_depth, m_rr_depth, m_hide_emitters, m_params, m_cache,
-                   no_light, write_layers)
+                   m_lamps, no_light, write_layers)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Medium)
+    using typename Base::Lights;
     using PathTracer   = manylights::PathTracer<Float, Spectrum>;
     using MediumReader = manylights::MediumReader<Float, Spectrum>;
     using GroupSums    = typename Base::Sums;
@@ -182,9 +186,8 @@ public:
                                               Mask active) const override {
         MI_MASKED_FUNCTION(ProfilerPhase::SamplingIntegratorSample, active);
         auto lights = m_cache.get(scene, sampler);
-        auto media  = MediumReader::with((*lights).media(), scene, medium);
-        PathTracer tracer(scene, *lights, media, m_params,
-                          { m_max_depth, m_rr_depth, m_hide_emitters });
+        PathTracer tracer(scene, *lights, media(*lights, scene, medium), m_params,
+                          { m_max_depth, m_rr_depth, m_hide_emitters }, m_lamps.get());
         manylights::Counts<Float> counts;
         GroupSums groups;
         auto result =
@@ -216,6 +219,13 @@ public:
     }
 
     MI_DECLARE_CLASS(ManyLightsVolpath)
+
+protected:
+    manylights::MediaKinds media(const Lights &lights, const Scene *scene,
+                                 const Medium *medium) const override {
+        return MediumReader::with(lights.media(), scene, medium);
+    }
+    bool shows_emitters() const override { return !m_hide_emitters && m_max_depth != 0; }
 };
 
 MANYLIGHTS_EXPORT_PLUGIN(ManyLightsVolpath)

@@ -63,6 +63,10 @@ struct CylinderLight {
         return 2 * kPi * g[6] * norm(g + 3) * kPi * brightness;
     }
 
+    static float diameter(const LightRow &row) {
+        return norm(row.geometry + 3) + 2 * row.geometry[6];
+    }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x, float) {

@@ -59,6 +59,10 @@ struct DiskLight {
         return edge_area(row.geometry + 3, row.geometry + 6) * kPi * kPi * brightness;
     }
 
+    static float diameter(const LightRow &row) {
+        return 2 * std::max(norm(row.geometry + 3), norm(row.geometry + 6));
+    }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x,

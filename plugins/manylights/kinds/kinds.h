@@ -46,6 +46,11 @@ template <typename F> auto with_kind(LightKind kind, const F &f) {
     return call<OtherLight>(f);
 }
 
+/// A bound of the distance of two of its points; 0 if the table knows no surface
+inline float light_diameter(const LightRow &row) {
+    return with_kind(kind_of(row), [&](auto light) { return light.diameter(row); });
+}
+
 /// Emitted power
 inline double light_power(const LightRow &row) {
     return with_kind(kind_of(row), [&](auto light) { return light.power(row); });

@@ -66,6 +66,8 @@ LightPoint<Float> surface_point(const mitsuba::Point<Float, 3> &p, const Float &
 
 /// What kinds have in common of whose surface the table knows nothing
 struct WithoutSurface {
+    static float diameter(const LightRow &) { return 0; }
+
     template <typename Float>
     static mitsuba::Vector<Float, 3> normal(const Row<Float> &,
                                             const typename Row<Float>::Point3f &) {

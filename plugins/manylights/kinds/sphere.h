@@ -72,6 +72,8 @@ struct SphereLight {
         return 4 * kPi * g[3] * g[3] * kPi * brightness;
     }
 
+    static float diameter(const LightRow &row) { return 2 * row.geometry[3]; }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x, float) {

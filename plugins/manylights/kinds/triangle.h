@@ -77,6 +77,12 @@ struct TriangleLight {
         return edge_area(row.geometry + 3, row.geometry + 6) * .5f * kPi * brightness;
     }
 
+    static float diameter(const LightRow &row) {
+        const float *u = row.geometry + 3, *v = row.geometry + 6;
+        return std::max(
+            { norm(u), norm(v), norm(u[0] - v[0], u[1] - v[1], u[2] - v[2]) });
+    }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x,

@@ -14,6 +14,7 @@
 
 #include "manylights/direct/direct_light.h"
 #include "manylights/scene/hidden_emitters.h"
+#include "manylights/scene/lamps_in_view.h"
 #include "scattering.h"
 
 namespace manylights {
@@ -31,11 +32,15 @@ public:
     using GroupLight  = manylights::GroupLight<Float, Spectrum>;
     using GroupSums   = typename GroupLight::Sums;
     using FloatD      = dr::detached_t<Float>;
+    using Lamps       = LampsInView<Float, Spectrum>;
 
+    /// @param lamps  that are put on the film otherwise, too; may be null
     PathTracer(const Scene *scene, const Lights &lights, const MediaKinds &media,
-               const SamplingParameters &params, const PathLimits &limits)
+               const SamplingParameters &params, const PathLimits &limits,
+               const Lamps *lamps)
         : m_scene(scene), m_direct(scene, lights, params, media), m_limits(limits),
-          m_media(media.any), m_segments(media.homogeneous && media.scattering),
+          m_lamps(lamps), m_media(media.any),
+          m_segments(media.homogeneous && media.scattering),
           m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr),
           m_flights(m_direct.media(), m_limits, m_segments),
           m_scattering(m_limits, m_segments) {}
@@ -136,6 +141,12 @@ private:
                                                light, active && !s.specular);
         Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
         Spectrum arrives = radiance * dr::detach(weight);
+        if (m_lamps) {
+            Mask first = active && s.depth == 0u;
+            arrives    = weigh_lamp<Float>(
+                arrives,
+                dr::select(first, m_lamps->weight(si, s.ray.d, light, first), 1.f));
+        }
         add(s, arrives, piece, active);
         GroupLight group_light = light_through(s, piece);
         if (group_light.is_wanted())
@@ -195,10 +206,15 @@ private:
 
     /// Add radiance of the vertex at the end of a piece
     void add(State &s, const Spectrum &radiance, const Piece &piece, Mask active) const {
+        dr::masked(s.result, active) = s.result + seen(s, radiance, piece);
+    }
+
+    /// What the camera sees of it
+    Spectrum seen(const State &s, const Spectrum &radiance, const Piece &piece) const {
         Spectrum value = s.throughput * radiance;
         if (m_media)
             value *= piece.seen;
-        dr::masked(s.result, active) = s.result + value;
+        return value;
     }
 
     // ----------------------------------------------------------------------- Scattering
@@ -301,6 +317,7 @@ private:
     const Scene *m_scene;
     DirectLight m_direct;
     PathLimits m_limits;
+    const Lamps *m_lamps;
     /// Are there media, and those whose single scattering is estimated along whole segments?
     /// Can a path find light by chance?
     bool m_media, m_segments, m_sees_lights;

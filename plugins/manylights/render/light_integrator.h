@@ -8,6 +8,7 @@
 #include "camera_sample.h"
 #include "film_channels.h"
 #include "first_hit.h"
+#include "lamp_splats.h"
 #include "learning_passes.h"
 #include "manylights/scene/light_cache.h"
 #include "ordered_blocks.h"
@@ -22,12 +23,13 @@ template <typename Float, typename Spectrum,
 class LightIntegrator : public BaseIntegrator<Float, Spectrum> {
 public:
     MI_IMPORT_BASE(BaseIntegrator, m_block_size, m_samples_per_pass, m_stop,
-                   m_render_timer, m_timeout, should_stop)
+                   m_render_timer, m_timeout, should_stop, m_hide_emitters)
     MI_IMPORT_TYPES(Scene, Sensor, Sampler, Film, ImageBlock, Medium)
     using Cache    = LightCache<Float, Spectrum>;
     using Lights   = typename Cache::Lights;
     using Pass     = manylights::Pass<Float, Spectrum>;
     using Learning = LearningPasses<Float, Spectrum>;
+    using Lamps    = LampsInView<Float, Spectrum>;
 
     LightIntegrator(const mitsuba::Properties &props, const SamplingParameters &params)
         : Base(props), m_params(params), m_aovs(read_aovs(props)), m_cache(m_params),
@@ -147,10 +149,19 @@ protected:
         return manylights::to_string(m_params) + aovs;
     }
 
+    /// Media that camera rays pass, if they begin in `medium`
+    virtual MediaKinds media(const Lights &, const Scene *, const Medium *) const {
+        return {};
+    }
+    /// Do camera rays show emitters that they hit first?
+    virtual bool shows_emitters() const { return !m_hide_emitters; }
+
     SamplingParameters m_params;
     std::vector<Aov> m_aovs;
     Cache m_cache;
     FilmChannels m_channels;
+    /// Of the rendering, those that it samples, too; null if there are none
+    std::unique_ptr<Lamps> m_lamps;
 
 private:
     using Renderer = std::conditional_t<dr::is_jit_v<Float>,
@@ -180,6 +191,36 @@ private:
         explicit Flag(bool &flag) : flag(flag) { flag = true; }
         ~Flag() { flag = false; }
         Flag(const Flag &) = delete;
+    };
+
+    /// The lamps that a rendering samples on the film, for a while
+    class LampsSession {
+    public:
+        LampsSession(LightIntegrator &integrator, const Lights &lights,
+                     const Scene *scene, Sensor *sensor)
+            : m_lamps(integrator.m_lamps) {
+            const Film *film = sensor->film();
+            if (integrator.shows_emitters() &&
+                !has_flag(film->flags(), mitsuba::FilmFlags::Special))
+                m_lamps = Lamps::find(lights, sensor, film_size(film));
+            if (m_lamps)
+                m_splats = std::make_unique<Splats>(
+                    scene, lights, *m_lamps,
+                    integrator.media(lights, scene, sensor->medium()), sensor,
+                    integrator.m_channels.groups);
+        }
+        ~LampsSession() { m_lamps.reset(); }
+        LampsSession(const LampsSession &) = delete;
+
+        void render(const Pass &pass) const {
+            if (m_splats)
+                m_splats->render(pass);
+        }
+
+    private:
+        using Splats = LampSplats<Float, Spectrum>;
+        std::unique_ptr<Lamps> &m_lamps;
+        std::unique_ptr<Splats> m_splats;
     };
 
     /// Follow the plan that was written; none ends a job
@@ -234,11 +275,14 @@ private:
         log_start(size, spp, plan.size());
         typename Learning::Session session(m_learning);
         m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
+        LampsSession lamps(*this, lights, scene, sensor);
         Renderer renderer(*this, scene, sensor, channels, m_block_size);
         for (size_t i = 0; i < plan.size() && !should_stop(); ++i) {
             m_learning.start_pass(plan[i]);
             Pass pass(plan[i], seed, spp, job, sampler);
             renderer.render(pass);
+            if (!should_stop())
+                lamps.render(pass);
             m_learning.end_pass(plan[i], film, m_channels.groups);
         }
         if constexpr (dr::is_jit_v<Float>)

@@ -1,0 +1,143 @@
+#pragma once
+
+/**
+ * Colours at any places of a film, summed as integers: in any order, on any number of threads, the
+ * sums have the same bits.
+ */
+
+#include <atomic>
+#include <cmath>
+#include <drjit/jit.h>
+#include <mitsuba/render/film.h>
+#include <mitsuba/render/imageblock.h>
+#include <vector>
+
+namespace manylights {
+
+template <typename Float, typename Spectrum> class FixedPointSums {
+public:
+    MI_IMPORT_TYPES(Film, ImageBlock, ReconstructionFilter)
+    /// How much larger than the mean of a lamp a value may be: others are cut off
+    static constexpr float kHeadroom = 0x1p14f;
+
+    /**
+     * @param most         no sum of a pixel exceeds this many times \ref kHeadroom
+     * @param groups       of lights that have layers
+     * @param first_layer  the first one among the channels that are not colours
+     */
+    FixedPointSums(Film *film, double most, uint32_t groups, size_t first_layer)
+        : m_film(film), m_size(film->crop_size()), m_filter(film->rfilter()),
+          m_box(m_filter->is_box_filter()), m_reach(m_box ? 0 : m_filter->border_size()),
+          m_groups(groups), m_first_layer((uint32_t) first_layer),
+          m_sums(make((size_t) numbers() * dr::prod(m_size))) {
+        int digits = 62 - 14 - std::ilogb(most) - 1;
+        digits     = std::clamp(digits, -100, 100);
+        m_unit     = dr::opaque<Float>(std::ldexp(1.f, -digits));
+        m_scale    = dr::opaque<Float>(std::ldexp(1.f, digits));
+    }
+
+    /// Add a value of a group of lights, if there are any, at a place of the film, in pixels from
+    /// the first one of the crop window
+    void add(const Point2f &place, const Color3f &value, const UInt32 &group,
+             const Mask &active) {
+        Vector2i first(dr::floor(place));
+        first -= (int) m_reach;
+        Vector2f from = Vector2f(first) + .5f - place;
+        uint32_t side = 2 * m_reach + 1;
+        for (uint32_t row = 0; row < side; ++row)
+            for (uint32_t column = 0; column < side; ++column) {
+                Vector2i pixel = first + Vector2i((int) column, (int) row);
+                Float weight   = m_box ? Float(1.f)
+                                       : filter(from.x() + (ScalarFloat) column) *
+                                             filter(from.y() + (ScalarFloat) row);
+                Mask inside    = active && dr::all(pixel >= 0) &&
+                                 pixel.x() < (int) m_size.x() &&
+                                 pixel.y() < (int) m_size.y();
+                UInt32 index(pixel.y() * (int) m_size.x() + pixel.x());
+                add(index, value * weight, group, inside);
+            }
+    }
+
+    /// Make them part of the film
+    void put() const {
+        mitsuba::ref<ImageBlock> block =
+            m_film->create_block(m_size, /* normalize = */ false, /* border = */ false);
+        block->set_offset(m_film->crop_offset());
+        uint32_t channels = (uint32_t) block->channel_count(), pixels = dr::prod(m_size);
+        for (uint32_t i = 0; i < numbers(); ++i) {
+            uint32_t channel = i < 3 ? i : layers() + i - 3;
+            if constexpr (dr::is_jit_v<Float>) {
+                UInt32 pixel = dr::arange<UInt32>(pixels);
+                dr::scatter(block->tensor().array(),
+                            Float(dr::reinterpret_array<Int64>(
+                                dr::gather<UInt64>(m_sums, pixel * numbers() + i))) *
+                                m_unit,
+                            pixel * channels + channel);
+            } else {
+                Float *data = block->tensor().array().data();
+                for (uint32_t pixel = 0; pixel < pixels; ++pixel)
+                    data[pixel * channels + channel] =
+                        (Float) (int64_t) m_sums[pixel * numbers() + i] * m_unit;
+            }
+        }
+        m_film->put_block(block);
+    }
+
+private:
+    /// Unsigned, as atomic additions on GPUs are: those of negative numbers are the same
+    using Sums = std::conditional_t<dr::is_jit_v<Float>, UInt64,
+                                    std::vector<std::atomic<uint64_t>>>;
+
+    static Sums make(size_t size) {
+        if constexpr (dr::is_jit_v<Float>)
+            return dr::zeros<UInt64>(size);
+        else
+            return Sums(size);
+    }
+
+    /// As samples of cameras get it
+    Float filter(const Float &x) const {
+        if constexpr (dr::is_jit_v<Float>)
+            return m_filter->eval(x);
+        else
+            return m_filter->eval_discretized(x);
+    }
+
+    void add(const UInt32 &pixel, const Color3f &value, const UInt32 &group,
+             const Mask &active) {
+        for (uint32_t i = 0; i < 3; ++i) {
+            UInt64 number =
+                dr::reinterpret_array<UInt64>(Int64(dr::round(value.entry(i) * m_scale)));
+            add(pixel * numbers() + i, number, active);
+            if (m_groups > 0)
+                add(pixel * numbers() + 3u + group * 3u + i, number, active);
+        }
+    }
+    void add(const UInt32 &index, const UInt64 &number, const Mask &active) {
+        if constexpr (dr::is_jit_v<Float>)
+            dr::scatter_reduce(ReduceOp::Add, m_sums, number, index, active);
+        else if (active)
+            m_sums[index].fetch_add(number, std::memory_order_relaxed);
+    }
+
+    /// Of a pixel: colours, and those of each group
+    uint32_t numbers() const { return 3 + 3 * m_groups; }
+    /// Where these are among the channels of the film, which has a weight, too
+    uint32_t layers() const {
+        bool alpha = has_flag(m_film->flags(), mitsuba::FilmFlags::Alpha);
+        return (alpha ? 5 : 4) + m_first_layer;
+    }
+
+    Film *m_film;
+    mitsuba::Vector<uint32_t, 2> m_size;
+    const ReconstructionFilter *m_filter;
+    bool m_box;
+    /// Pixels that a value reaches on each side
+    uint32_t m_reach;
+    uint32_t m_groups, m_first_layer;
+    Sums m_sums;
+    /// Of the integers, and its inverse
+    Float m_unit, m_scale;
+};
+
+} // namespace manylights

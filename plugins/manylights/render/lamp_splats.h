@@ -1,0 +1,236 @@
+#pragma once
+
+/**
+ * Points on lamps that are small on the film (scene/lamps_in_view.h), seen from the camera and put
+ * on the film. Each sample of the pixels has its points, a function of its number and the seed
+ * alone: passes may have any of them.
+ */
+
+#include "fixed_point_sums.h"
+#include "manylights/base/divide.h"
+#include "manylights/sampler/sobol.h"
+#include "manylights/scene/lamps_in_view.h"
+#include "manylights/scene/media.h"
+#include "manylights/scene/scene_emission.h"
+#include "passes.h"
+
+namespace manylights {
+
+template <typename Float, typename Spectrum> class LampSplats {
+public:
+    MI_IMPORT_TYPES(Scene, Sensor, Film, Medium, MediumPtr)
+    using Lights   = SceneLights<Float, Spectrum>;
+    using Lamps    = LampsInView<Float, Spectrum>;
+    using Emission = SceneEmission<Float, Spectrum>;
+    using Media    = manylights::Media<Float, Spectrum>;
+    using Sums     = FixedPointSums<Float, Spectrum>;
+    using Pass     = manylights::Pass<Float, Spectrum>;
+    using FloatD   = typename Lights::FloatD;
+    using UInt32D  = typename Lights::UInt32D;
+    using MaskD    = typename Lights::MaskD;
+    using PointD   = mitsuba::Point<FloatD, 3>;
+    using VectorD  = mitsuba::Vector<FloatD, 3>;
+
+    /**
+     * @param media        that camera rays pass; none if they end at the first surface
+     * @param first_layer  that of groups of lights among the channels that are not colours
+     */
+    LampSplats(const Scene *scene, const Lights &lights, const Lamps &lamps,
+               const MediaKinds &media, Sensor *sensor, size_t first_layer)
+        : m_scene(scene), m_lights(lights), m_lamps(lamps), m_emission(scene, lights),
+          m_media(scene, media), m_sensor(sensor), m_film(sensor->film()),
+          m_first_layer(first_layer) {}
+
+    /// Those of a pass. Its samples are complete with the pixels that do not train.
+    void render(const Pass &pass) const {
+        if (pass.plan.role == Role::Train)
+            return;
+        UInt32D key = mitsuba::sample_tea_32(UInt32D(plain(pass.plan_seed)),
+                                             UInt32D(pass.plan.scramble), 8)
+                          .first;
+        dr::make_opaque(key);
+        Sums sums(m_film, m_lamps.most(pass.plan.count), m_lights.groups().count(),
+                  m_first_layer);
+        uint32_t points = m_lamps.points(), most = std::max(kMostLanes / points, 1u);
+        for (uint32_t done = 0; done < pass.plan.count; done += most) {
+            uint32_t count = std::min(most, pass.plan.count - done) * points;
+            if constexpr (dr::is_jit_v<Float>) {
+                auto [sample, point] = divide(dr::arange<UInt32D>(count), points);
+                add(sums, key, sample + dr::opaque<UInt32D>(pass.plan.first + done),
+                    point);
+                dr::eval();
+            } else {
+                dr::parallel_for(dr::blocked_range<uint32_t>(0, count, kGrain),
+                                 [&](const auto &range) {
+                                     for (uint32_t i : range)
+                                         add(sums, key,
+                                             pass.plan.first + done + i / points,
+                                             i % points);
+                                 });
+            }
+        }
+        sums.put();
+    }
+
+private:
+    static constexpr uint32_t kMostLanes = 1u << 28, kGrain = 1024;
+
+    /// Random numbers of a point
+    class Numbers {
+    public:
+        Numbers(const UInt32D &key, const UInt32D &sample, const UInt32D &point)
+            : m_key(key), m_sample(sample), m_point(mix_bits<UInt32D>(point + key)) {}
+
+        /// Where the choice of lamps begins, the same for all points of a sample
+        UInt32D start() const { return numbers(0).number(); }
+
+        /// Even for the samples of a pixel; points have different ones
+        mitsuba::Point<FloatD, 2> pair(uint32_t dimension) const {
+            auto [a, b] = numbers(dimension).pair();
+            UInt32D c   = mix_bits<UInt32D>(m_point + dimension * 0x9e3779b9u);
+            return { fraction(a ^ c), fraction(b ^ mix_bits<UInt32D>(c ^ 0x5bd1e995u)) };
+        }
+
+        typename Media::Rng rng() const {
+            using UInt64D = dr::uint64_array_t<UInt32D>;
+            auto [a, b]   = mitsuba::sample_tea_32(m_sample, m_point);
+            return { 1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(3) };
+        }
+
+    private:
+        SobolSample<UInt32D> numbers(uint32_t dimension) const {
+            return { m_key, m_sample, UInt32D(dimension) };
+        }
+        static FloatD fraction(const UInt32D &digits) {
+            return FloatD(digits >> 8u) * 0x1p-24f;
+        }
+
+        UInt32D m_key, m_sample, m_point;
+    };
+
+    /// A point of a lamp, as a camera sees it
+    struct Seen {
+        Row<FloatD> row;
+        LightPoint<FloatD> point;
+        UInt32D light;
+        Ray3f ray;
+        Float distance;
+    };
+
+    void add(Sums &sums, const UInt32D &key, const UInt32D &sample,
+             const UInt32D &number) const {
+        Numbers u(key, sample, number);
+        auto lamp = m_lamps.at(number, u.start());
+        if (dr::none_or<false>(lamp.active))
+            return;
+        Seen seen;
+        seen.light         = dr::select(lamp.active, lamp.light, 0u);
+        seen.row           = m_lights.tree().row(seen.light, lamp.active);
+        const auto &camera = m_lamps.camera();
+        PointD from  = camera.has_lens() ? camera.lens_point(u.pair(4)) : camera.position;
+        auto on_lamp = u.pair(2);
+        seen.point =
+            by_kind<LightPoint<FloatD>>(seen.row, m_lights.table_kinds(), [&](auto kind) {
+                return kind.sample(seen.row, from, on_lamp);
+            });
+        VectorD d    = dr::normalize(seen.point.p - from);
+        FloatD depth = camera.depth(seen.point.p);
+        auto place   = camera.on_film(seen.point.p, from);
+        MaskD active = lamp.active && seen.point.pdf > 0.f && depth >= camera.near_clip &&
+                       depth <= camera.far_clip && is_rendered(place);
+        if (dr::none_or<false>(active))
+            return;
+
+        FloatD cosine = dr::dot(d, camera.axes[2]);
+        seen.ray = Ray3f(Point3f(from + d * (camera.near_clip / cosine)), Vector3f(d));
+        seen.distance  = Float((depth - camera.near_clip) / cosine);
+        seen.ray.maxt  = Float((camera.far_clip - camera.near_clip) / cosine);
+        Spectrum value = draw_spectrum(seen.ray, u) *
+                         Float(m_lamps.weight(d, lamp.rate, seen.point.pdf));
+        value *= look(seen, u, Mask(active));
+        Color3f color = to_color(value, seen.ray.wavelengths, active);
+        FloatD most   = seen.row[kBrightness] * Sums::kHeadroom;
+        active &= plain(dr::all(dr::isfinite(color)));
+        UInt32D group(0);
+        if (m_lights.groups().count() > 0)
+            group = m_lights.groups().of_light(m_lights.tree(), seen.light, active);
+        sums.add(Point2f(place), dr::clip(color, -Float(most), Float(most)), group,
+                 Mask(active));
+    }
+
+    /// Does the film have samples there?
+    MaskD is_rendered(const mitsuba::Point<FloatD, 2> &place) const {
+        float border =
+            m_film->sample_border() ? (float) m_film->rfilter()->border_size() : 0.f;
+        auto size = m_film->crop_size();
+        return place.x() >= -border && place.x() < (float) size.x() + border &&
+               place.y() >= -border && place.y() < (float) size.y() + border;
+    }
+
+    /// Time and wavelengths of a ray, as samples of cameras have them. Returns their weight.
+    Spectrum draw_spectrum(Ray3f &ray, const Numbers &u) const {
+        bool moves = m_sensor->shutter_open_time() > 0.f;
+        ray.time   = m_sensor->shutter_open();
+        Spectrum weight(1.f);
+        if (!moves && !mitsuba::is_spectral_v<Spectrum>)
+            return weight;
+        auto pair = u.pair(6);
+        if (moves)
+            ray.time += Float(pair.x()) * m_sensor->shutter_open_time();
+        if constexpr (mitsuba::is_spectral_v<Spectrum>)
+            std::tie(ray.wavelengths, weight) = m_sensor->sample_wavelengths(
+                dr::zeros<SurfaceInteraction3f>(), Float(pair.y()), true);
+        return weight;
+    }
+
+    /// What arrives of the emission of a point
+    Spectrum look(const Seen &seen, const Numbers &u, Mask active) const {
+        Point3f p(seen.point.p);
+        Interaction3f from(0.f, seen.ray.time, seen.ray.wavelengths, seen.ray.o);
+        Spectrum arrives(1.f);
+        if (m_media.kinds().any) {
+            auto rng         = u.rng();
+            MediumPtr medium = m_sensor->medium();
+            arrives          = m_media.transmittance(from, p, medium, rng, active);
+        } else {
+            // What a camera ray would find; nothing before the point will do
+            auto pi   = m_scene->ray_intersect_preliminary(seen.ray, false, active);
+            Mask past = !pi.is_valid() || pi.t >= seen.distance;
+            past |= Mask(m_lights.find(pi.shape, plain(pi.prim_index),
+                                       plain(active && pi.is_valid())) == seen.light);
+            active &= past;
+        }
+        Spectrum emission = mitsuba::depolarizer<Spectrum>(
+            m_emission.color(seen.row, seen.ray.wavelengths) &
+            Mask(seen.row.tabulated()));
+        if (m_lights.needs_emitter_eval())
+            m_emission.add_masked(emission, active && !Mask(seen.row.tabulated()),
+                                  [&](Mask mask) {
+                                      return m_emission.emission_by_emitter(
+                                          from, seen.row, seen.point, seen.ray.d, mask);
+                                  });
+        return arrives * emission & active;
+    }
+
+    static Color3f to_color(const Spectrum &value, const Wavelength &wavelengths,
+                            const Mask &active) {
+        UnpolarizedSpectrum spectrum = mitsuba::unpolarized_spectrum(value);
+        if constexpr (mitsuba::is_spectral_v<Spectrum>)
+            return mitsuba::spectrum_to_srgb(spectrum, wavelengths, active);
+        else if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
+            return spectrum.x();
+        else
+            return spectrum;
+    }
+
+    const Scene *m_scene;
+    const Lights &m_lights;
+    const Lamps &m_lamps;
+    Emission m_emission;
+    Media m_media;
+    Sensor *m_sensor;
+    Film *m_film;
+    size_t m_first_layer;
+};
+
+} // namespace manylights
