@@ -11,10 +11,11 @@ import mitsuba as mi
 import pytest
 from manylights.loading import has_backend
 
-# Processes of tests share the cores; tests of threads choose their number themselves
+# Processes of tests share the cores; tests of threads choose their number themselves. Mitsuba does
+# not read images with a single thread.
 PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if PROCESSES > 1:
-    dr.set_thread_count(max(1, dr.thread_count() // PROCESSES))
+    dr.set_thread_count(max(2, dr.thread_count() // PROCESSES))
 
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono_polarized")
 """Variants that the tests run in by default."""
