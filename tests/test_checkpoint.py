@@ -57,15 +57,16 @@ sys.exit(cli.main(sys.argv[1:]))
 
 #: Python for CHILD: the third file is written to one half, then the process is killed.
 DIES_WHILE_WRITING = """
-import os, pathlib, signal
-write, files = pathlib.Path.write_bytes, []
-def write_half(path, data):
-    files.append(path)
-    if len(files) == 3:
-        write(path, data[: len(data) // 2])
+import os, signal
+from manylights import files
+flush, written = files._flush, []
+def write_half(path):
+    written.append(path)
+    if len(written) == 3:
+        os.truncate(path, path.stat().st_size // 2)
         os.kill(os.getpid(), signal.SIGKILL)
-    write(path, data)
-pathlib.Path.write_bytes = write_half
+    flush(path)
+files._flush = write_half
 """
 
 

@@ -382,7 +382,7 @@ def test_means_of_finished_images_are_the_sum_of_their_layers(scalar, tmp_path):
 
 def test_objects_and_films_without_colours_have_no_light_groups(scalar):
     scene = stage() | lamps()
-    with pytest.raises(UsageError, match="must be descriptions"):
+    with pytest.raises(UsageError, match="light_groups: the scene is made already"):
         manylights.render(mi.load_dict(scene), light_groups="key=lamp_*")
     scene["camera"]["film"]["pixel_format"] = "luminance"
     with pytest.raises(UsageError, match="has pixel_format y, layers need"):

@@ -115,10 +115,10 @@ std::string Parameter::allowed(double high) const {
 }
 
 std::string Parameter::text_of(double value) const {
+    if (type == Type::List || (type == Type::Text && texts.empty()))
+        return "";
     if (type == Type::Text)
-        return texts.empty() ? "" : std::string(texts[(size_t) value]);
-    if (type == Type::List)
-        return "none";
+        return std::string(texts[(size_t) value]);
     if (type == Type::Boolean)
         return value > 1 ? std::string(texts[0]) : value > 0 ? "true" : "false";
     std::ostringstream oss;

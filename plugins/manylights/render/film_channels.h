@@ -14,11 +14,17 @@ struct FilmChannels {
     std::vector<std::string> names;
     /// Where the surfaces' begin, and the groups'
     size_t aovs, groups;
+    /// Where each emission of the lamps in sight begins
+    std::vector<size_t> emissions;
 
     FilmChannels(const SamplingParameters &params, const std::vector<Aov> &list)
         : names(count_channels(params)) {
-        aovs   = names.size();
-        groups = append(channel_names(list));
+        aovs = groups = names.size();
+        for (const Aov &aov : list) {
+            if (aov.type == AovType::Emission)
+                emissions.push_back(names.size());
+            groups = append(channel_names({ aov }));
+        }
         append(group_channels(params.light_groups));
     }
 

@@ -7,6 +7,7 @@
 
 #include "aov_list.h"
 #include "manylights/scene/hidden_emitters.h"
+#include "manylights/scene/lamps_in_view.h"
 #include "shape_numbers.h"
 #include "visible_albedo.h"
 
@@ -16,9 +17,13 @@ template <typename Float, typename Spectrum> class FirstHit {
 public:
     MI_IMPORT_TYPES(Scene)
     using Numbers = ShapeNumbers<Float, Spectrum>;
+    using Lamps   = LampsInView<Float, Spectrum>;
 
-    FirstHit(const Scene *scene, const Numbers &numbers, bool hide_emitters)
-        : m_scene(scene), m_numbers(numbers), m_hide_emitters(hide_emitters) {}
+    /// @param lamps  that are put on the film otherwise, too; may be null
+    FirstHit(const Scene *scene, const Numbers &numbers, bool hide_emitters,
+             const Lamps *lamps)
+        : m_scene(scene), m_numbers(numbers), m_hide_emitters(hide_emitters),
+          m_lamps(lamps) {}
 
     /// Write the channels of a list
     MI_NOINLINE void write(const std::vector<Aov> &aovs, const RayDifferential3f &ray,
@@ -86,6 +91,8 @@ private:
         if (dr::none_or<false>(active))
             return 0.f;
         auto radiance = mitsuba::unpolarized_spectrum(emitter->eval(si, active));
+        if (m_lamps)
+            radiance *= m_lamps->weight(si, ray.d, active);
         return VisibleAlbedo<Float, Spectrum>::to_color(radiance & active, ray, active);
     }
 
@@ -114,6 +121,7 @@ private:
     const Scene *m_scene;
     const Numbers &m_numbers;
     bool m_hide_emitters;
+    const Lamps *m_lamps;
 };
 
 } // namespace manylights

@@ -5,6 +5,7 @@
  * sums have the same bits.
  */
 
+#include "film_channels.h"
 #include <atomic>
 #include <cmath>
 #include <drjit/jit.h>
@@ -21,25 +22,36 @@ public:
     static constexpr float kHeadroom = 0x1p14f;
 
     /**
-     * @param most         no sum of a pixel exceeds this many times \ref kHeadroom
-     * @param groups       of lights that have layers
-     * @param first_layer  the first one among the channels that are not colours
+     * @param most      no sum of a pixel exceeds this many times \ref kHeadroom
+     * @param channels  what the film has beside colours
+     * @param groups    of lights that have layers
      */
-    FixedPointSums(Film *film, double most, uint32_t groups, size_t first_layer)
+    FixedPointSums(Film *film, double most, const FilmChannels &channels, uint32_t groups)
         : m_film(film), m_size(film->crop_size()), m_filter(film->rfilter()),
-          m_box(m_filter->is_box_filter()), m_reach(m_box ? 0 : m_filter->border_size()),
-          m_groups(groups), m_first_layer((uint32_t) first_layer),
-          m_sums(make((size_t) numbers() * dr::prod(m_size))) {
+          m_box(m_filter->is_box_filter()), m_reach(m_box ? 0 : m_filter->border_size()) {
+        bool alpha    = has_flag(film->flags(), mitsuba::FilmFlags::Alpha);
+        size_t others = alpha ? 5 : 4; // there is a weight, too
+        add_channels(0);
+        for (size_t emission : channels.emissions)
+            add_channels(others + emission);
+        m_first_group = (uint32_t) m_channels.size();
+        for (uint32_t group = 0; group < groups; ++group)
+            add_channels(others + channels.groups + 3 * group);
+        m_sums     = make(m_channels.size() * dr::prod(m_size));
         int digits = 62 - 14 - std::ilogb(most) - 1;
         digits     = std::clamp(digits, -100, 100);
         m_unit     = dr::opaque<Float>(std::ldexp(1.f, -digits));
         m_scale    = dr::opaque<Float>(std::ldexp(1.f, digits));
     }
 
-    /// Add a value of a group of lights, if there are any, at a place of the film, in pixels from
-    /// the first one of the crop window
-    void add(const Point2f &place, const Color3f &value, const UInt32 &group,
-             const Mask &active) {
+    /// What a point of a lamp adds: to the image, to its own emission in sight, and to its group
+    struct Value {
+        Color3f arrives, emission;
+        UInt32 group;
+    };
+
+    /// Add it at a place of the film, in pixels from the first one of the crop window
+    void add(const Point2f &place, const Value &value, const Mask &active) {
         Vector2i first(dr::floor(place));
         first -= (int) m_reach;
         Vector2f from = Vector2f(first) + .5f - place;
@@ -54,7 +66,7 @@ public:
                                  pixel.x() < (int) m_size.x() &&
                                  pixel.y() < (int) m_size.y();
                 UInt32 index(pixel.y() * (int) m_size.x() + pixel.x());
-                add(index, value * weight, group, inside);
+                add(index, value, weight, inside);
             }
     }
 
@@ -64,20 +76,19 @@ public:
             m_film->create_block(m_size, /* normalize = */ false, /* border = */ false);
         block->set_offset(m_film->crop_offset());
         uint32_t channels = (uint32_t) block->channel_count(), pixels = dr::prod(m_size);
-        for (uint32_t i = 0; i < numbers(); ++i) {
-            uint32_t channel = i < 3 ? i : layers() + i - 3;
+        for (uint32_t i = 0; i < count(); ++i) {
             if constexpr (dr::is_jit_v<Float>) {
                 UInt32 pixel = dr::arange<UInt32>(pixels);
                 dr::scatter(block->tensor().array(),
                             Float(dr::reinterpret_array<Int64>(
-                                dr::gather<UInt64>(m_sums, pixel * numbers() + i))) *
+                                dr::gather<UInt64>(m_sums, pixel * count() + i))) *
                                 m_unit,
-                            pixel * channels + channel);
+                            pixel * channels + m_channels[i]);
             } else {
                 Float *data = block->tensor().array().data();
                 for (uint32_t pixel = 0; pixel < pixels; ++pixel)
-                    data[pixel * channels + channel] =
-                        (Float) (int64_t) m_sums[pixel * numbers() + i] * m_unit;
+                    data[pixel * channels + m_channels[i]] =
+                        (Float) (int64_t) m_sums[pixel * count() + i] * m_unit;
             }
         }
         m_film->put_block(block);
@@ -103,29 +114,34 @@ private:
             return m_filter->eval_discretized(x);
     }
 
-    void add(const UInt32 &pixel, const Color3f &value, const UInt32 &group,
+    void add(const UInt32 &pixel, const Value &value, const Float &weight,
              const Mask &active) {
-        for (uint32_t i = 0; i < 3; ++i) {
-            UInt64 number =
-                dr::reinterpret_array<UInt64>(Int64(dr::round(value.entry(i) * m_scale)));
-            add(pixel * numbers() + i, number, active);
-            if (m_groups > 0)
-                add(pixel * numbers() + 3u + group * 3u + i, number, active);
-        }
-    }
-    void add(const UInt32 &index, const UInt64 &number, const Mask &active) {
-        if constexpr (dr::is_jit_v<Float>)
-            dr::scatter_reduce(ReduceOp::Add, m_sums, number, index, active);
-        else if (active)
-            m_sums[index].fetch_add(number, std::memory_order_relaxed);
+        UInt32 first = pixel * count();
+        add_color(first, value.arrives * weight, active);
+        for (uint32_t i = 3; i < m_first_group; i += 3)
+            add_color(first + i, value.emission * weight, active);
+        if (m_first_group < count())
+            add_color(first + m_first_group + value.group * 3u, value.arrives * weight,
+                      active);
     }
 
-    /// Of a pixel: colours, and those of each group
-    uint32_t numbers() const { return 3 + 3 * m_groups; }
-    /// Where these are among the channels of the film, which has a weight, too
-    uint32_t layers() const {
-        bool alpha = has_flag(m_film->flags(), mitsuba::FilmFlags::Alpha);
-        return (alpha ? 5 : 4) + m_first_layer;
+    void add_color(const UInt32 &index, const Color3f &color, const Mask &active) {
+        for (uint32_t i = 0; i < 3; ++i) {
+            UInt64 number =
+                dr::reinterpret_array<UInt64>(Int64(dr::round(color.entry(i) * m_scale)));
+            if constexpr (dr::is_jit_v<Float>)
+                dr::scatter_reduce(ReduceOp::Add, m_sums, number, index + i, active);
+            else if (active)
+                m_sums[index + i].fetch_add(number, std::memory_order_relaxed);
+        }
+    }
+
+    /// Numbers of a pixel
+    uint32_t count() const { return (uint32_t) m_channels.size(); }
+
+    void add_channels(size_t first) {
+        for (size_t i = 0; i < 3; ++i)
+            m_channels.push_back((uint32_t) (first + i));
     }
 
     Film *m_film;
@@ -134,7 +150,9 @@ private:
     bool m_box;
     /// Pixels that a value reaches on each side
     uint32_t m_reach;
-    uint32_t m_groups, m_first_layer;
+    /// Of the film, for each number: colours, those of emission, those of each group
+    std::vector<uint32_t> m_channels;
+    uint32_t m_first_group;
     Sums m_sums;
     /// Of the integers, and its inverse
     Float m_unit, m_scale;

@@ -32,14 +32,14 @@ public:
     using VectorD  = mitsuba::Vector<FloatD, 3>;
 
     /**
-     * @param media        that camera rays pass; none if they end at the first surface
-     * @param first_layer  that of groups of lights among the channels that are not colours
+     * @param media     that camera rays pass; none if they end at the first surface
+     * @param channels  what the film has beside colours
      */
     LampSplats(const Scene *scene, const Lights &lights, const Lamps &lamps,
-               const MediaKinds &media, Sensor *sensor, size_t first_layer)
+               const MediaKinds &media, Sensor *sensor, const FilmChannels &channels)
         : m_scene(scene), m_lights(lights), m_lamps(lamps), m_emission(scene, lights),
           m_media(scene, media), m_sensor(sensor), m_film(sensor->film()),
-          m_first_layer(first_layer) {}
+          m_channels(channels) {}
 
     /// Those of a pass. Its samples are complete with the pixels that do not train.
     void render(const Pass &pass) const {
@@ -49,8 +49,8 @@ public:
                                              UInt32D(pass.plan.scramble), 8)
                           .first;
         dr::make_opaque(key);
-        Sums sums(m_film, m_lamps.most(pass.plan.count), m_lights.groups().count(),
-                  m_first_layer);
+        Sums sums(m_film, m_lamps.most(pass.plan.count), m_channels,
+                  m_lights.groups().count());
         uint32_t points = m_lamps.points(), most = std::max(kMostLanes / points, 1u);
         for (uint32_t done = 0; done < pass.plan.count; done += most) {
             uint32_t count = std::min(most, pass.plan.count - done) * points;
@@ -143,19 +143,33 @@ private:
 
         FloatD cosine = dr::dot(d, camera.axes[2]);
         seen.ray = Ray3f(Point3f(from + d * (camera.near_clip / cosine)), Vector3f(d));
-        seen.distance  = Float((depth - camera.near_clip) / cosine);
-        seen.ray.maxt  = Float((camera.far_clip - camera.near_clip) / cosine);
-        Spectrum value = draw_spectrum(seen.ray, u) *
-                         Float(m_lamps.weight(d, lamp.rate, seen.point.pdf));
-        value *= look(seen, u, Mask(active));
-        Color3f color = to_color(value, seen.ray.wavelengths, active);
-        FloatD most   = seen.row[kBrightness] * Sums::kHeadroom;
-        active &= plain(dr::all(dr::isfinite(color)));
-        UInt32D group(0);
+        seen.distance     = Float((depth - camera.near_clip) / cosine);
+        seen.ray.maxt     = Float((camera.far_clip - camera.near_clip) / cosine);
+        Spectrum emission = draw_spectrum(seen.ray, u);
+        emission *= Float(m_lamps.weight(d, lamp.rate, seen.point.pdf));
+        emission *= emitted(seen, Mask(active));
+        put(sums, seen, place, emission, u, active);
+    }
+
+    /// Put what arrives of the emission of a point on the film
+    void put(Sums &sums, const Seen &seen, const mitsuba::Point<FloatD, 2> &place,
+             const Spectrum &emission, const Numbers &u, MaskD active) const {
+        FloatD most = seen.row[kBrightness] * Sums::kHeadroom;
+        auto color  = [&](const Spectrum &value) {
+            Color3f result = to_color(value, seen.ray.wavelengths, Mask(active));
+            active &= plain(dr::all(dr::isfinite(result)));
+            return dr::clip(result, -Float(most), Float(most));
+        };
+        typename Sums::Value value;
+        bool media     = m_media.kinds().any;
+        value.arrives  = color(transmittance(seen, u, Mask(active)) * emission);
+        value.emission = value.arrives;
+        if (media && !m_channels.emissions.empty())
+            value.emission = color(emission & in_sight(seen, Mask(active)));
+        value.group = 0;
         if (m_lights.groups().count() > 0)
-            group = m_lights.groups().of_light(m_lights.tree(), seen.light, active);
-        sums.add(Point2f(place), dr::clip(color, -Float(most), Float(most)), group,
-                 Mask(active));
+            value.group = m_lights.groups().of_light(m_lights.tree(), seen.light, active);
+        sums.add(Point2f(place), value, Mask(active));
     }
 
     /// Does the film have samples there?
@@ -183,23 +197,28 @@ private:
         return weight;
     }
 
-    /// What arrives of the emission of a point
-    Spectrum look(const Seen &seen, const Numbers &u, Mask active) const {
-        Point3f p(seen.point.p);
+    /// How much of it arrives
+    Spectrum transmittance(const Seen &seen, const Numbers &u, Mask active) const {
+        if (!m_media.kinds().any)
+            return dr::select(in_sight(seen, active), Spectrum(1.f), Spectrum(0.f));
         Interaction3f from(0.f, seen.ray.time, seen.ray.wavelengths, seen.ray.o);
-        Spectrum arrives(1.f);
-        if (m_media.kinds().any) {
-            auto rng         = u.rng();
-            MediumPtr medium = m_sensor->medium();
-            arrives          = m_media.transmittance(from, p, medium, rng, active);
-        } else {
-            // What a camera ray would find; nothing before the point will do
-            auto pi   = m_scene->ray_intersect_preliminary(seen.ray, false, active);
-            Mask past = !pi.is_valid() || pi.t >= seen.distance;
-            past |= Mask(m_lights.find(pi.shape, plain(pi.prim_index),
-                                       plain(active && pi.is_valid())) == seen.light);
-            active &= past;
-        }
+        auto rng         = u.rng();
+        MediumPtr medium = m_sensor->medium();
+        return m_media.transmittance(from, Point3f(seen.point.p), medium, rng, active);
+    }
+
+    /// Would a camera ray find it? Nothing before the point will do
+    Mask in_sight(const Seen &seen, Mask active) const {
+        auto pi   = m_scene->ray_intersect_preliminary(seen.ray, false, active);
+        Mask past = !pi.is_valid() || pi.t >= seen.distance;
+        past |= Mask(m_lights.find(pi.shape, plain(pi.prim_index),
+                                   plain(active && pi.is_valid())) == seen.light);
+        return active && past;
+    }
+
+    /// The emission of a point towards the camera
+    Spectrum emitted(const Seen &seen, Mask active) const {
+        Interaction3f from(0.f, seen.ray.time, seen.ray.wavelengths, seen.ray.o);
         Spectrum emission = mitsuba::depolarizer<Spectrum>(
             m_emission.color(seen.row, seen.ray.wavelengths) &
             Mask(seen.row.tabulated()));
@@ -209,7 +228,7 @@ private:
                                       return m_emission.emission_by_emitter(
                                           from, seen.row, seen.point, seen.ray.d, mask);
                                   });
-        return arrives * emission & active;
+        return emission & active;
     }
 
     static Color3f to_color(const Spectrum &value, const Wavelength &wavelengths,
@@ -230,7 +249,43 @@ private:
     Media m_media;
     Sensor *m_sensor;
     Film *m_film;
-    size_t m_first_layer;
+    const FilmChannels &m_channels;
+};
+
+/// The lamps that a rendering samples on the film: known to its camera rays for a while
+template <typename Float, typename Spectrum> class LampPasses {
+public:
+    MI_IMPORT_TYPES(Scene, Sensor)
+    using Splats = LampSplats<Float, Spectrum>;
+    using Lamps  = typename Splats::Lamps;
+    using Lights = typename Splats::Lights;
+
+    /**
+     * @param known  where camera rays find them
+     * @param shown  can there be any?
+     * The others are those of \ref LampSplats.
+     */
+    LampPasses(std::unique_ptr<Lamps> &known, const Lights &lights, const Scene *scene,
+               Sensor *sensor, bool shown, const MediaKinds &media,
+               const FilmChannels &channels)
+        : m_known(known) {
+        if (shown)
+            m_known = Lamps::find(lights, sensor, film_size(sensor->film()));
+        if (m_known)
+            m_splats = std::make_unique<Splats>(scene, lights, *m_known, media, sensor,
+                                                channels);
+    }
+    ~LampPasses() { m_known.reset(); }
+    LampPasses(const LampPasses &) = delete;
+
+    void render(const typename Splats::Pass &pass) const {
+        if (m_splats)
+            m_splats->render(pass);
+    }
+
+private:
+    std::unique_ptr<Lamps> &m_known;
+    std::unique_ptr<Splats> m_splats;
 };
 
 } // namespace manylights

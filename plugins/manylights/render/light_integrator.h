@@ -139,7 +139,7 @@ protected:
                     bool hide_emitters, Mask active) const {
         if (m_aovs.empty() || !channels)
             return;
-        FirstHit<Float, Spectrum>(scene, m_shape_numbers, hide_emitters)
+        FirstHit<Float, Spectrum>(scene, m_shape_numbers, hide_emitters, m_lamps.get())
             .write(m_aovs, ray, channels + m_channels.aovs, active);
     }
 
@@ -191,36 +191,6 @@ private:
         explicit Flag(bool &flag) : flag(flag) { flag = true; }
         ~Flag() { flag = false; }
         Flag(const Flag &) = delete;
-    };
-
-    /// The lamps that a rendering samples on the film, for a while
-    class LampsSession {
-    public:
-        LampsSession(LightIntegrator &integrator, const Lights &lights,
-                     const Scene *scene, Sensor *sensor)
-            : m_lamps(integrator.m_lamps) {
-            const Film *film = sensor->film();
-            if (integrator.shows_emitters() &&
-                !has_flag(film->flags(), mitsuba::FilmFlags::Special))
-                m_lamps = Lamps::find(lights, sensor, film_size(film));
-            if (m_lamps)
-                m_splats = std::make_unique<Splats>(
-                    scene, lights, *m_lamps,
-                    integrator.media(lights, scene, sensor->medium()), sensor,
-                    integrator.m_channels.groups);
-        }
-        ~LampsSession() { m_lamps.reset(); }
-        LampsSession(const LampsSession &) = delete;
-
-        void render(const Pass &pass) const {
-            if (m_splats)
-                m_splats->render(pass);
-        }
-
-    private:
-        using Splats = LampSplats<Float, Spectrum>;
-        std::unique_ptr<Lamps> &m_lamps;
-        std::unique_ptr<Splats> m_splats;
     };
 
     /// Follow the plan that was written; none ends a job
@@ -275,7 +245,11 @@ private:
         log_start(size, spp, plan.size());
         typename Learning::Session session(m_learning);
         m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
-        LampsSession lamps(*this, lights, scene, sensor);
+        bool shows_lamps =
+            shows_emitters() && !has_flag(film->flags(), mitsuba::FilmFlags::Special);
+        LampPasses<Float, Spectrum> lamps(m_lamps, lights, scene, sensor, shows_lamps,
+                                          media(lights, scene, sensor->medium()),
+                                          m_channels);
         Renderer renderer(*this, scene, sensor, channels, m_block_size);
         for (size_t i = 0; i < plan.size() && !should_stop(); ++i) {
             m_learning.start_pass(plan[i]);

@@ -212,6 +212,15 @@ public:
         return Float(weight(d, rate, dr::select(found, pdf, 0.f)));
     }
 
+    /// The same for any surface
+    Float weight(const SurfaceInteraction3f &si, const Vector3f &direction,
+                 Mask active) const {
+        active &= si.is_valid();
+        return weight(si, direction,
+                      m_lights.find(si.shape, plain(si.prim_index), plain(active)),
+                      active);
+    }
+
 private:
     explicit LampsInView(const Lights &lights) : m_lights(lights) {}
 

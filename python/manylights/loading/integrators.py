@@ -67,7 +67,7 @@ SAMPLING_PARAMETERS = {
 AOVS = Parameter(
     "NAME:TYPE between commas with the TYPE albedo, depth, position, uv, geo_normal, sh_normal, "
     "dp_du, dp_dv, duv_dx, duv_dy, prim_index, shape_index or emission",
-    "none",
+    "",
 )
 
 #: What each plugin accepts.

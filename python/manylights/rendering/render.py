@@ -105,12 +105,10 @@ def render(
     however often it was interrupted; so does ``until_noise``. The current variant is used.
 
     Args:
-        scene: path of an XML file or a USD stage; a dictionary as for ``mi.load_dict``; an
-            ``mi.Scene``, which is rendered as it is; or what ``manylights.loading.load`` returned.
-            Of files and dictionaries ``direct``, ``path`` and ``volpath`` are replaced by our
-            integrators, ``independent`` by ``manylights_sobol``.
-        spp: samples per pixel, 1 or more; with a target the most there may be. Default: what the
-            scene's sampler says, with a target 65536.
+        scene: path of an XML file or a USD stage, a dictionary as for ``mi.load_dict``, an
+            ``mi.Scene``, or what ``manylights.loading.load`` returned. Of files and dictionaries
+            ``direct``, ``path``, ``volpath`` and ``independent`` are replaced by ours.
+        spp: samples per pixel, with a target the most. Default: the sampler's, or 65536.
         seed: of the random numbers, 0 to 4294967295.
         sensor: index of the sensor, from 0.
         integrator: ``None`` for the choice above, ``"keep"`` for the scene's own, the name of a
