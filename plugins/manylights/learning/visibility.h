@@ -93,10 +93,12 @@ public:
         : m_records(records), m_camera(size.camera[0], size.camera[1], size.camera[2]),
           m_scene(size.scene), m_counting(true), m_factors(dr::zeros<Storage>(records)) {
         if constexpr (dr::is_jit_v<Float>) {
-            m_counts = dr::zeros<UInt32>(count_size());
-            dr::make_opaque(m_camera, m_scene, m_counting, m_factors, m_counts);
+            m_counts = dr::zeros<UInt32>(records * kCounts);
+            m_cells  = dr::zeros<UInt32>(records);
+            dr::make_opaque(m_camera, m_scene, m_counting, m_factors, m_counts, m_cells);
         } else {
-            m_counts = Counts(count_size());
+            m_counts = Counts(records * kCounts);
+            m_cells  = Counts(records);
         }
     }
 
@@ -137,12 +139,11 @@ public:
                        dr::select(arrived, UInt32(1), UInt32(0));
         if constexpr (dr::is_jit_v<Float>) {
             dr::scatter_add(m_counts, UInt32(1), index, active);
-            dr::scatter_reduce(ReduceOp::Max, m_counts, cell, cell_index(place), active);
+            dr::scatter_reduce(ReduceOp::Max, m_cells, cell, place, active);
         } else if (active) {
             m_counts[index].fetch_add(1, std::memory_order_relaxed);
-            auto &known     = m_counts[cell_index(place)];
-            uint32_t before = known.load(std::memory_order_relaxed);
-            while (before < cell && !known.compare_exchange_weak(before, cell))
+            uint32_t before = m_cells[place].load(std::memory_order_relaxed);
+            while (before < cell && !m_cells[place].compare_exchange_weak(before, cell))
                 ;
         }
     }
@@ -159,20 +160,28 @@ public:
         if (records <= m_records)
             return;
         if constexpr (dr::is_jit_v<Float>) {
-            UInt32 factor = dr::arange<UInt32>(records),
-                   count  = dr::arange<UInt32>(records * (kCounts + 1));
-            m_factors     = dr::gather<UInt32>(m_factors, factor & (m_records - 1u));
-            m_counts      = dr::gather<UInt32>(m_counts, before_growth(count, records));
-            dr::make_opaque(m_factors, m_counts);
+            auto repeat = [&](const UInt32 &array, uint32_t width) {
+                UInt32 index = dr::arange<UInt32>(records * width);
+                return dr::gather<UInt32>(array, index & (m_records * width - 1u));
+            };
+            m_factors = repeat(m_factors, 1);
+            m_counts  = repeat(m_counts, kCounts);
+            m_cells   = repeat(m_cells, 1);
+            dr::make_opaque(m_factors, m_counts, m_cells);
         } else {
+            auto repeat = [&](auto &result, const auto &array, uint32_t width) {
+                for (size_t i = 0; i < (size_t) records * width; ++i)
+                    result[i] = (uint32_t) array[i & (m_records * width - 1)];
+            };
             Storage factors = dr::empty<Storage>(records);
-            Counts counts((size_t) records * (kCounts + 1));
-            for (uint32_t i = 0; i < records; ++i)
+            Counts counts(records * kCounts), cells(records);
+            for (size_t i = 0; i < records; ++i)
                 factors.data()[i] = m_factors.data()[i & (m_records - 1)];
-            for (uint32_t i = 0; i < counts.size(); ++i)
-                counts[i] = m_counts[before_growth(i, records)].load();
+            repeat(counts, m_counts, kCounts);
+            repeat(cells, m_cells, 1);
             m_factors = std::move(factors);
             m_counts  = std::move(counts);
+            m_cells   = std::move(cells);
         }
         m_records = records;
     }
@@ -180,12 +189,16 @@ public:
     /// What was counted: for each record and child the rays that were blocked and those that
     /// arrived; then the cell of each record
     Storage counts() const {
+        uint32_t size = m_records * kCounts;
         if constexpr (dr::is_jit_v<Float>) {
-            return m_counts;
+            Storage result = dr::zeros<Storage>(count_size());
+            dr::scatter(result, m_counts, dr::arange<UInt32>(size));
+            dr::scatter(result, m_cells, dr::arange<UInt32>(m_records) + size);
+            return result;
         } else {
-            Storage result = dr::empty<Storage>(m_counts.size());
-            for (size_t i = 0; i < m_counts.size(); ++i)
-                result.data()[i] = m_counts[i].load(std::memory_order_relaxed);
+            Storage result = dr::empty<Storage>(count_size());
+            for (size_t i = 0; i < count_size(); ++i)
+                result.data()[i] = i < size ? m_counts[i] : m_cells[i - size];
             return result;
         }
     }
@@ -194,12 +207,14 @@ public:
 
     /// Go on from what was counted elsewhere, in a table of the same size
     void set_counts(const Storage &counts) {
+        uint32_t size = m_records * kCounts;
         if constexpr (dr::is_jit_v<Float>) {
-            m_counts = counts;
-            dr::make_opaque(m_counts);
+            m_counts = dr::gather<UInt32>(counts, dr::arange<UInt32>(size));
+            m_cells  = dr::gather<UInt32>(counts, dr::arange<UInt32>(m_records) + size);
+            dr::make_opaque(m_counts, m_cells);
         } else {
-            for (size_t i = 0; i < m_counts.size(); ++i)
-                m_counts[i] = counts.data()[i];
+            for (size_t i = 0; i < count_size(); ++i)
+                (i < size ? m_counts[i] : m_cells[i - size]) = counts.data()[i];
         }
     }
 
@@ -270,15 +285,6 @@ private:
         Float rays, gain;
     };
 
-    /// Where the cell of a record is kept: the largest of those that share it, 0 if it is empty
-    UInt32 cell_index(const UInt32 &record) const { return m_records * kCounts + record; }
-
-    /// Where a number of more `records` comes from
-    UInt32 before_growth(const UInt32 &index, uint32_t records) const {
-        return dr::select(index < records * kCounts, index & (m_records * kCounts - 1u),
-                          cell_index(index & (m_records - 1u)));
-    }
-
     dr::Array<Float, kCounts> read(const UInt32 &record, const Mask &active) const {
         using Record = dr::Array<UInt32, kCounts>;
         if constexpr (dr::is_jit_v<Float>) {
@@ -312,9 +318,9 @@ private:
         };
         UInt32 cell;
         if constexpr (dr::is_jit_v<Float>)
-            cell = dr::gather<UInt32>(m_counts, cell_index(record), active);
+            cell = dr::gather<UInt32>(m_cells, record, active);
         else
-            cell = m_counts[cell_index(record)].load(std::memory_order_relaxed);
+            cell = m_cells[record].load(std::memory_order_relaxed);
         State state{ (record - cell) & (m_records - 1u), Float(0.f), Float(1.f), active };
         state.active &= state.node < nodes;
         loop(
@@ -360,6 +366,8 @@ private:
     Mask m_counting;
     Storage m_factors;
     mutable Counts m_counts;
+    /// The cell of each record, the largest of those that share it
+    mutable Counts m_cells;
 };
 
 } // namespace manylights
