@@ -98,7 +98,7 @@ def test_unbiased(variant, case):
     name, kind = case.split("-")
     scene = mi.load_dict(SCENES[name]())
     reference = integrator(kind, **REFERENCES[kind])
-    seeds = range(8)  # find half of the bias that has to be found
+    seeds = range(12)
     expected = images(scene, reference, range(100, 108), REFERENCE_SAMPLES[kind])
     learnt = images(scene, integrator(kind), seeds)
     tools.assert_same_mean(learnt, expected, label=f"{case}, learning")

@@ -149,7 +149,7 @@ public:
                 s.active &= passes;
                 if (dr::none_or<false>(s.active))
                     return;
-                cross(s, si);
+                cross(s, si, to);
             },
             "Media: transmittance");
         rng = std::move(state.rng);
@@ -250,19 +250,19 @@ private:
         return passes;
     }
 
-    /// Pass the surface that a shadow ray has reached
-    template <typename State> void cross(State &s, const SurfaceInteraction3f &si) const {
+    /// Pass the surface that a shadow ray to a point has reached
+    template <typename State>
+    void cross(State &s, const SurfaceInteraction3f &si, const Point3f &to) const {
         BSDFPtr bsdf                   = si.bsdf();
         Spectrum value                 = bsdf->eval_null_transmission(si, s.active);
         value                          = si.to_world_mueller(value, si.wi, si.wi);
         dr::masked(s.result, s.active) = s.result * value;
-        Ray3f next                     = si.spawn_ray(s.ray.d);
-        // It starts a little off the surface, and ends where the whole ray does
-        Float left                  = s.ray.maxt - dr::dot(next.o - s.ray.o, s.ray.d);
-        next.maxt                   = left;
-        dr::masked(s.ray, s.active) = next;
+        // It starts a little aside, so it has to be aimed again
+        Ray3f next                  = shadow_ray<Float, Spectrum>(si, to);
+        Mask ahead                  = next.maxt > 0.f && dr::dot(next.d, s.ray.d) > 0.f;
         s.medium                    = medium_beyond(si, s.medium, s.ray.d, s.active);
-        s.active &= left > 0.f && dr::any(mitsuba::unpolarized_spectrum(s.result) != 0.f);
+        dr::masked(s.ray, s.active) = next;
+        s.active &= ahead && dr::any(mitsuba::unpolarized_spectrum(s.result) != 0.f);
     }
 
     const Scene *m_scene;
