@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Union
 
 import numpy as np
 
@@ -17,7 +18,7 @@ OF_THE_RENDER = ("variance.", "denoised.")
 #: Facts about it that are not those of a mix.
 OWN_FACTS = ("noise",)
 
-Weight = float | Sequence[float]
+Weight = Union[float, Sequence[float]]
 
 
 @dataclass
