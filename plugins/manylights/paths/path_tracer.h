@@ -204,17 +204,12 @@ private:
         return light;
     }
 
-    /// Add radiance of the vertex at the end of a piece
+    /// Add radiance of the vertex at the end of a piece, as the camera sees it
     void add(State &s, const Spectrum &radiance, const Piece &piece, Mask active) const {
-        dr::masked(s.result, active) = s.result + seen(s, radiance, piece);
-    }
-
-    /// What the camera sees of it
-    Spectrum seen(const State &s, const Spectrum &radiance, const Piece &piece) const {
         Spectrum value = s.throughput * radiance;
         if (m_media)
             value *= piece.seen;
-        return value;
+        dr::masked(s.result, active) = s.result + value;
     }
 
     // ----------------------------------------------------------------------- Scattering
