@@ -155,6 +155,14 @@ def test_what_to_install_is_named(monkeypatch, tmp_path, capsys):
     assert cli.main(command) == 2 and "manylights[denoise]" in capsys.readouterr().err
 
 
+def test_what_the_denoiser_lacks_is_named(monkeypatch, tmp_path):
+    (tmp_path / "mitsuba_oidn.py").write_text("import no_such_library")
+    monkeypatch.delitem(sys.modules, "mitsuba_oidn", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UsageError, match=r"mitsuba-oidn.*\(No module named 'no_such_library'\)"):
+        denoise.check_installed()
+
+
 def test_parts_are_denoised_when_they_are_one(oidn, tmp_path):
     whole, files = tmp_path / "a.exr", []
     manylights.render(box_filtered(), output=whole, spp=4, denoise=True)
