@@ -11,6 +11,11 @@ from manylights.progress import say
 from manylights.rendering.merge import merge
 
 HELP = """\
+examples:
+  manylights merge image.part-*.exr -o image.exr
+  manylights merge image.part-*.exr -o preview.exr --partial
+  manylights merge seed0.exr seed1.exr -o mean.exr
+
 Adds the parts of a render, and writes its image with a PNG preview beside it. The parts are
 those that manylights render --part K/N wrote, checkpoints, or files of earlier mergings. The
 image is that of one render without parts, bit for bit, whatever their number, order and

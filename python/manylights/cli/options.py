@@ -17,11 +17,10 @@ VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scala
 
 
 def add_scene(parser) -> None:
-    """Add SCENE and the options that say how it is read; ``defines`` and others give them back."""
+    """Add SCENE and ``-D``; ``defines`` gives that back. How stages are read is ``add_usd``."""
     scene = parser.add_argument("scene", metavar="SCENE", help="XML file or USD stage")
     scene.complete = shtab.FILE
     add_define(parser)
-    add_usd(parser)
 
 
 def add_define(parser) -> None:

@@ -45,7 +45,12 @@ The file has one part. Colours and alpha have the film's number format, layers 3
 --aov albedo,normal,position,depth,uv gives albedo.R, normal.X, P.X, Z, uv.U and so on, of
 the surfaces in sight and from the same rays; parameters counts=true gives counts.*;
 --until-noise and --for give variance.*; with layers there is samples. --denoise adds
-denoised.*, best with a box filter, and leaves the image as it is.
+denoised.*, best with a box filter, and leaves the image as it is. --exposure is for the PNG.
+
+--light-groups 'key=lamp_*,windows=facade' gives RGBA_key.R, RGBA_windows.R, RGBA_rest.R and
+so on: the light of emitters whose id, or that of their shape, fits the pattern, and of all
+others. The image is the sum of these layers. manylights mix OUT.exr key=2 windows=0 -o
+OTHER.exr makes the one group brighter and switches the other off, without rendering again.
 
 With --checkpoint the state of the render is kept in OUT.checkpoint.exr, a picture, too,
 after each step that ends SECONDS or more after the last one was written. After a crash, a
@@ -117,6 +122,7 @@ def add(commands, common) -> None:
     )
     _add_layers(parser)
     _add_parts(parser)
+    shared.add_usd(parser)
     shared.add_machine(parser)
     parser.set_defaults(command=_run)
 
