@@ -218,7 +218,8 @@ def read_colors(path: str | Path, prefix: str = "") -> np.ndarray:
     image = np.stack([planes[name] for name in chosen], axis=-1)
     if chosen == ("X", "Y", "Z"):
         image = image @ TO_RGB.T
-    image = np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
+    # A copy: the view of a broadcast cannot be written, which FLIP insists on
+    image = np.broadcast_to(image, (*image.shape[:2], 3)).copy()
     broken = int(np.sum(~np.isfinite(image).all(axis=2)))
     if broken:
         raise UsageError(f"{prefix}{path}: {broken} pixels are infinite or not a number")
