@@ -78,7 +78,8 @@ def denoised(image: np.ndarray, names: list[str], exposure: float = 1.0) -> np.n
     guides = {}
     for guide, letters in zip(GUIDES, ("RGB", "XYZ")):
         wanted = [f"{guide}.{letter}" for letter in letters]
-        if all(name in names for name in wanted):
+        # It takes normals with the albedo alone
+        if all(name in names for name in wanted) and (guide == GUIDES[0] or guides):
             guides[guide] = _planes(image, names, wanted)
     emitted = _emitted(image, names, exposure, color)
     color = np.ascontiguousarray(color - emitted)
