@@ -6,6 +6,7 @@ import argparse
 
 import mitsuba as mi
 
+from manylights.cli import options as shared
 from manylights.output import images
 from manylights.progress import say
 from manylights.rendering.merge import merge
@@ -48,13 +49,16 @@ def add(commands, common) -> None:
         action="store_true",
         help="add layers denoised.* and show them in the PNG, as manylights render does",
     )
+    shared.add_exposure(parser)
     parser.set_defaults(command=_run)
 
 
 def _run(options) -> None:
     mi.set_variant("scalar_rgb")
     images.check_output(options.output)
-    merged = merge(options.parts, options.output, options.partial, options.denoise)
+    merged = merge(
+        options.parts, options.output, options.partial, options.denoise, options.exposure
+    )
     for note in merged.notes:
         say(note)
     names = " and ".join(str(path) for path in merged.files)

@@ -45,6 +45,7 @@ def add(commands, common) -> None:
         "weights", nargs="+", metavar="GROUP=X", help="factor of a group's light, or GROUP=R,G,B"
     )
     parser.add_argument("-o", "--output", required=True, metavar="OUT.exr", help="image to write")
+    shared.add_exposure(parser)
     parser.set_defaults(command=_run)
 
 
@@ -55,7 +56,7 @@ def _run(options) -> None:
     if len(texts) < len(options.weights):
         raise UsageError("mix: a group is given twice")
     weights = {name: _weight(name, text) for name, text in texts.items()}
-    mixed = mix(options.image, weights, options.output)
+    mixed = mix(options.image, weights, options.output, options.exposure)
     for note in mixed.notes:
         say(note)
     say(f"mixed {options.image}, wrote {' and '.join(str(path) for path in mixed.files)}")

@@ -69,6 +69,17 @@ def add_machine(parser) -> None:
     group.add_argument("--threads", type=positive, help="CPU threads of the render (default: all)")
 
 
+def add_exposure(parser) -> None:
+    """Add how bright the PNG is."""
+    parser.add_argument(
+        "--exposure",
+        type=stops,
+        default=0.0,
+        metavar="EV",
+        help="stops by which the PNG is brighter (default: 0)",
+    )
+
+
 def defines(options) -> dict[str, str]:
     """Return the values of ``-D`` by name.
 

@@ -147,13 +147,7 @@ def _add_layers(parser) -> None:
         help="add layers denoised.* by Open Image Denoise and show them in the PNG; implies "
         "--aov albedo,normal,emission (needs manylights[denoise])",
     )
-    group.add_argument(
-        "--exposure",
-        type=shared.stops,
-        default=0.0,
-        metavar="EV",
-        help="stops by which the PNG is brighter (default: 0)",
-    )
+    shared.add_exposure(group)
     group.add_argument(
         "--tev",
         nargs="?",

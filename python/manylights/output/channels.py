@@ -73,6 +73,11 @@ def sums(sequences: int) -> list[str]:
     return [f"checkpoint{number}_{part}." for number in numbers for part in SUM_PARTS]
 
 
+def is_sum(name: str) -> bool:
+    """Is this channel a part of the sums that a checkpoint has, and no picture?"""
+    return re.match(rf"checkpoint\d*_({'|'.join(SUM_PARTS)})\.", name) is not None
+
+
 def aov_list(names: str | Sequence[str], option: str = "aovs") -> str:
     """Return the parameter ``aovs`` of our integrators for these names.
 
