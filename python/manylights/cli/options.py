@@ -170,7 +170,7 @@ def stops(text: str) -> float:
     return value
 
 
-def part(text: str) -> Part:
+def part(text: str) -> Part | None:
     """A part of several: 3/16."""
     numbers = text.split("/")
     if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -195,7 +196,7 @@ def join(channels: list[str], *parts: np.ndarray):
         parts: of shape (height, width, channels).
     """
     # Made of an array, a bitmap calls its channels Y and A or R, G and B.
-    size = [parts[0].shape[1], parts[0].shape[0]]
+    size: Any = [parts[0].shape[1], parts[0].shape[0]]
     kind = mi.Struct.Type.Float32
     bitmap = mi.Bitmap(_formats.MultiChannel, kind, size, len(channels), list(channels))
     pixels = np.array(bitmap, copy=False).reshape(*parts[0].shape[:2], -1)

@@ -67,7 +67,7 @@ def write_images(
     # Layers of light groups add up to the bit.
     number = np.float32 if light_groups.groups(channels.names(bitmap)) else number
     planes, notes = _planes(bitmap, number)
-    planes |= light_groups.alphas(planes) | (layers or {})
+    planes |= {**light_groups.alphas(planes), **(layers or {})}
     if samples is not None and any(not channels.is_beauty(name) for name in planes):
         # An image alone says so in its attributes
         planes |= channels.samples_layer(next(iter(planes.values())).shape, samples)
