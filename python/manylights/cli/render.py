@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 
@@ -213,7 +214,11 @@ def _parameter_help() -> str:
     lines = []
     for plugin, parameters in integrators.PARAMETERS.items():
         lines += ["", f"parameters of {plugin}:"]
-        lines += [f"  {name:<14}  {parameter}" for name, parameter in parameters.items()]
+        width = max(map(len, parameters))
+        for name, parameter in parameters.items():
+            wrapped = textwrap.wrap(str(parameter), 86 - width)
+            names = [name, *[""] * (len(wrapped) - 1)]
+            lines += [f"  {first:<{width}}  {text}" for first, text in zip(names, wrapped)]
     return "\n".join(lines[1:])
 
 
