@@ -98,9 +98,10 @@ bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
 microbench: $(INSTALLED) $(VENV)/.dev-tools  ## Time building, traversal and resampling alone (a minute) into microbench.json
 	$(BIN)/python -m pytest tests/bench_tree.py --benchmark-json=microbench.json $(ARGS)
 
+# All anew, in seconds: Sphinx does not see that a parser or the list of pages has changed.
 .PHONY: docs
 docs: $(DEMO_INSTALLED) $(VENV)/.docs-tools  ## Build the documentation into build/docs/html
-	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/doctrees python/docs build/docs/html
+	$(BIN)/python -m sphinx -W --keep-going -q -E -a -d build/docs/doctrees python/docs build/docs/html
 
 .PHONY: lint
 lint: $(VENV)/.dev-tools  ## Check style and common mistakes, without compiling

@@ -1,6 +1,7 @@
 """`--denoise`: images without noise beside those with it."""
 
 import sys
+from types import SimpleNamespace
 
 import manylights
 import mitsuba as mi
@@ -153,6 +154,34 @@ def test_what_to_install_is_named(monkeypatch, tmp_path, capsys):
         manylights.render(scene(), spp=1, denoise=True)
     command = ["render", "no.xml", "-o", str(tmp_path / "a.exr"), "--denoise"]
     assert cli.main(command) == 2 and "manylights[denoise]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "used"),
+    [("normal", []), ("albedo", ["albedo"]), ("albedo,normal", ["albedo", "normal"])],
+)
+def test_normals_alone_are_no_guide(monkeypatch, given, used):
+    """Open Image Denoise has no filter for them."""
+    seen = []
+
+    def filtered(color, hdr, **guides):
+        seen.append(list(guides))
+        return color
+
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", SimpleNamespace(denoise=filtered))
+    letters = {"albedo": "RGB", "normal": "XYZ"}
+    layers = [f"{name}.{letter}" for name in given.split(",") for letter in letters[name]]
+    image = np.ones((4, 4, 3 + len(layers)), np.float32)
+    denoise.denoised(image, [*"RGB", *layers])
+    assert seen == [used]
+
+
+def test_what_the_denoiser_lacks_is_named(monkeypatch, tmp_path):
+    (tmp_path / "mitsuba_oidn.py").write_text("import no_such_library")
+    monkeypatch.delitem(sys.modules, "mitsuba_oidn", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UsageError, match=r"mitsuba-oidn.*\(No module named 'no_such_library'\)"):
+        denoise.check_installed()
 
 
 def test_parts_are_denoised_when_they_are_one(oidn, tmp_path):

@@ -16,7 +16,8 @@ README = (ROOT / "README.md").read_text()
 
 #: Pages with links that must lead somewhere.
 PAGES = (
-    *("README.md", "CHANGELOG.md", ".github/CONTRIBUTING.md", "plugins/README.md"),
+    *("README.md", "CHANGELOG.md", ".github/CONTRIBUTING.md", ".github/SECURITY.md"),
+    "plugins/README.md",
     *("scenes/README.md", "scenes/bench/README.md", "scenes/bench/more.md", "tests/README.md"),
 )
 

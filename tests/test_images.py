@@ -11,6 +11,7 @@ from manylights import cli, files
 from manylights.errors import UsageError
 from manylights.output import exr, images
 from manylights.rendering import metadata
+from manylights.rendering.parts import Part
 
 from tests.conftest import require_variant
 
@@ -124,6 +125,34 @@ def test_a_render_says_how_it_was_made(tmp_path, capsys):
     told = capsys.readouterr().out
     for text in ("16 x 12", "variance.R", "shadow_rays = 4", "scalar_rgb", "worldToNDC"):
         assert text in told
+
+
+def test_info_of_a_part_is_short(tmp_path, capsys):
+    """Without sums and what was learnt, and with the command as it is typed."""
+    part = Part(1, 2, command=("render", "a.xml", "-D", "x=1 2"))
+    manylights.render(scene(), spp=4, part=part, output=tmp_path / "a.exr")
+    assert cli.main(["info", str(tmp_path / "a.part-01-of-02.exr")]) == 0
+    told = capsys.readouterr().out
+    assert "B, G, R and their sums" in told and "checkpoint_" not in told
+    assert "manylights render a.xml -D 'x=1 2'" in told
+    assert all(len(line) < 200 for line in told.splitlines())
+
+
+@pytest.mark.parametrize("option", ["render", "merge"])
+def test_the_preview_alone_gets_brighter(tmp_path, option):
+    paths = [tmp_path / "a.exr", tmp_path / "b.exr"]
+    for path, stops in zip(paths, (0.0, 2.0)):
+        if option == "render":
+            manylights.render(scene(), spp=4, output=path, exposure=stops)
+        else:
+            part = manylights.render(scene(), spp=4, output=path, part=(1, 1)).files
+            manylights.merge(part, path, exposure=stops)
+    planes = [exr.read(path)[0] for path in paths]
+    assert all((planes[0][name] == planes[1][name]).all() for name in planes[0])
+    dark, bright = (np.array(mi.Bitmap(str(path.with_suffix(".png")))) for path in paths)
+    assert bright.mean() > 1.2 * dark.mean()
+    with pytest.raises(UsageError, match=r"exposure 1.0: must be left out with part"):
+        manylights.render(scene(), spp=1, exposure=1.0, part=(1, 2))
 
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])

@@ -202,14 +202,9 @@ def lamp(kind):
     return {
         "point": lambda: {"type": "point", "position": [0, 0, 30], "intensity": rgb(RADIANCE)},
         "spot": lambda: {"type": "spot", "to_world": down, "intensity": rgb(RADIANCE)},
-        "projector": lambda: {"type": "projector", "to_world": down, "irradiance": 1.0},
         "rectangle": lambda: emitter(type="rectangle", to_world=down.scale(0.005)),
         "disk": lambda: emitter(type="disk", to_world=down.scale(0.005)),
         "cube": lambda: emitter(type="cube", to_world=small),
-        "sphere": lambda: emitter(type="sphere", center=[0, 0, 30], radius=0.005),
-        "cylinder": lambda: emitter(
-            type="cylinder", p0=[0, -0.005, 30], p1=[0, 0.005, 30], radius=0.005
-        ),
         "textured": lambda: {
             "type": "rectangle",
             "to_world": down.scale(0.005),
@@ -218,12 +213,11 @@ def lamp(kind):
     }[kind]()
 
 
-KINDS = ["point", "spot", "projector", "rectangle", "disk", "cube", "sphere", "cylinder"]
 
 
 @VARIANTS
 @pytest.mark.parametrize("integrator", [DIRECT, PATHS], ids=["direct", "volpath"])
-@pytest.mark.parametrize("kind", [*KINDS, "textured"])
+@pytest.mark.parametrize("kind", ["point", "spot", "rectangle", "disk", "cube", "textured"])
 def test_far_lamp_does_not_shine_through_its_shade(variant, kind, integrator):
     """A shade .02 below the lamp, which is less than a thousandth of the distance."""
     shade = {

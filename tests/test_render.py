@@ -418,3 +418,19 @@ def test_samplers_can_be_kept_or_named(tmp_path):
     name, parameters, notes = chosen(tmp_path, jittered, "independent")
     assert (name, parameters) == ("independent", {"sample_count": 16})
     assert notes == ["sampler: multijitter replaced by independent"]
+
+
+def test_an_image_that_was_stopped_is_none(tmp_path):
+    """Mitsuba ends a render early after an interrupt, also where Python ignores that."""
+    require_variant("scalar_rgb")
+    scene = mi.load_dict(manylights.scenes.behind_wall(12, width=64, height=48))
+    path = tmp_path / "a.exr"
+
+    def stop(progress):
+        if progress.fraction > 0.0:
+            scene.integrator().cancel()
+
+    with pytest.raises(UsageError, match="stopped before its end"):
+        manylights.render(scene, spp=64, output=path, progress=stop)
+    assert not path.exists()
+    assert manylights.render(scene, spp=1, output=path).samples == 1

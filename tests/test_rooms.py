@@ -1,6 +1,7 @@
 """How the code is laid out: who imports or includes whom, and how long things are."""
 
 import ast
+import builtins
 import re
 from collections import defaultdict
 from pathlib import Path
@@ -67,6 +68,42 @@ def test_classes_and_functions_are_short(kind, longest):
         if isinstance(node, kind)
     }
     assert {name: length for name, length in lengths.items() if length > longest} == {}
+
+
+def unions_at_run_time(tree):
+    """Return the lines with `X | Y` of types, outside of annotations, which nobody evaluates."""
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.BinOp)
+        for part in ast.walk(node.value)
+        if isinstance(part, ast.BinOp)
+        and isinstance(part.op, ast.BitOr)
+        and any(is_type(side) for side in (part.left, part.right))
+    ]
+
+
+def is_type(node):
+    """Is this the name of a built-in type, None, or a generic type as `Sequence[float]`?"""
+    if isinstance(node, ast.Constant):
+        return node.value is None
+    if isinstance(node, ast.Subscript):
+        return isinstance(node.value, ast.Name) and node.value.id[:1].isupper()
+    return isinstance(node, ast.Name) and isinstance(getattr(builtins, node.id, None), type)
+
+
+def test_no_module_needs_a_later_python():
+    """From 3.10 on types have the operator |; in 3.9 the import fails."""
+    assert {
+        parts: found for parts, tree in TREES.items() if (found := unions_at_run_time(tree))
+    } == {}
+
+
+def test_unions_at_run_time_are_found():
+    text = (
+        "x: int | None = 1\nW = float | Sequence[float]\ny = a | b\nV = str | None\nz = {} | c[0]"
+    )
+    assert unions_at_run_time(ast.parse(text)) == [2, 4]
 
 
 def test_no_two_classes_have_one_name():

@@ -335,6 +335,16 @@ def test_few_lights_need_no_visibility(variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("count", [12, 40])
+def test_small_tables_learn(variant, count):
+    """Dr.Jit copies small arrays for each thread, and then allows only one kind of sum."""
+    scene = mi.load_dict(manylights.scenes.behind_wall(count, **size()))
+    learns = integrator(learn_visibility="keep")
+    assert np.isfinite(render(scene, learns)).all()
+    assert np.array(mi.traverse(learns)["visibility.counts"]).sum() > 0
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 def test_other_integrators_read_only(variant):
     """`moment` asks for samples only: nothing is learnt, nothing changes."""
     scene = mi.load_dict(hidden_points())

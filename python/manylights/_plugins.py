@@ -64,7 +64,7 @@ def register() -> None:
         ImportError: Mitsuba is missing, has another version, or the plugins are not built.
     """
     folder = plugin_dir()
-    resolver = _import_mitsuba().file_resolver()
+    resolver = _import_mitsuba().file_resolver()  # pyright: ignore[reportCallIssue]
     if folder not in [str(entry) for entry in resolver]:
         resolver.append(folder)
 

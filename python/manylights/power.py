@@ -15,6 +15,7 @@ pi A times the mean radiance of a surface. Lights that surround the scene (``con
 from __future__ import annotations
 
 from contextlib import contextmanager
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -130,8 +131,10 @@ def _power_or_nan(emitter, numbers: np.ndarray) -> float:
     scalar = mi.variant().startswith("scalar")
     try:
         if not scalar:
-            return float(np.mean(_ray_weight(emitter, [mi.Float(row) for row in numbers])))
-        return float(np.mean([_ray_weight(emitter, list(column)) for column in numbers.T]))
+            weights: Any = _ray_weight(emitter, [mi.Float(row) for row in numbers])
+        else:
+            weights = [_ray_weight(emitter, list(column)) for column in numbers.T]
+        return float(np.mean(weights))
     except RuntimeError:
         return float("nan")
 

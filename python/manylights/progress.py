@@ -108,7 +108,7 @@ def _show_waiting(title: str, done: threading.Event) -> None:
     silent = not console.is_terminal
     with Progress(*columns, console=console, disable=silent, transient=True) as bar:
         task = bar.add_task(title, total=None)
-        bar.tasks[task].start_time -= PATIENCE
+        bar.tasks[task].start_time = bar.get_time() - PATIENCE
         done.wait()
 
 

@@ -161,7 +161,7 @@ private:
                 dr::masked(result, other) = Sample::make(
                     Spectrum(1.f),
                     mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess)),
-                    Point3f(0.f), Point3f(0.f));
+                    Point3f(0.f), Point3f(0.f), Mask(false));
             } else if (dr::any_or<true>(other)) {
                 Sample sample = sample_emitter(vertex, m_emission.emitter_of(row), u,
                                                Float(inclusion), other);
@@ -201,7 +201,8 @@ private:
         Mask delta      = is_delta(row, m_lights.table_kinds());
         Spectrum f      = scatter(vertex, d, light_pdf, delta, active);
         return Sample::make(f & active, emission * Float(point.weight) & active,
-                            Point3f(point.p), from.p);
+                            Point3f(point.p), from.p,
+                            Mask(may_end_close(row, m_lights.table_kinds())));
     }
 
     /// What the vertex scatters times the MIS weight of the light side
@@ -222,7 +223,7 @@ private:
         auto [ds, weight] = emitter->sample_direction(vertex.origin(), u, active);
         active &= ds.pdf != 0.f;
         Spectrum f = scatter(vertex, ds.d, inclusion * ds.pdf, ds.delta, active);
-        return Sample::make(f & active, weight & active, ds.p, ds.p);
+        return Sample::make(f & active, weight & active, ds.p, ds.p, Mask(false));
     }
 
     /// Which of many lights at infinity a number chooses; it can be used again then

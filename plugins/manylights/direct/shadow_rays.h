@@ -242,7 +242,7 @@ private:
                      Mask active) const {
         if (!vertex.inside) {
             Mask occluded = m_scene->ray_test(
-                shadow_ray<Float, Spectrum>(vertex.si, sample.p), active);
+                shadow_ray<Float, Spectrum>(vertex.si, sample.p, sample.close), active);
             return sample.unoccluded() & (active && !occluded);
         }
         Interaction3f origin = vertex.origin();
@@ -251,8 +251,8 @@ private:
         auto medium =
             m_media.medium_beyond(vertex.si, vertex.inside->medium, sample.p - origin.p,
                                   vertex.on_surface(active));
-        return sample.through(
-                   m_media.transmittance(origin, sample.p, medium, rng, active)) &
+        return sample.through(m_media.transmittance(origin, sample.p, sample.close,
+                                                    medium, rng, active)) &
                active;
     }
 

@@ -138,8 +138,10 @@ public:
                index = place * kCounts + 2u * slot +
                        dr::select(arrived, UInt32(1), UInt32(0));
         if constexpr (dr::is_jit_v<Float>) {
-            dr::scatter_add(m_counts, UInt32(1), index, active);
-            dr::scatter_reduce(ReduceOp::Max, m_cells, cell, place, active);
+            // Without the copies that Dr.Jit makes of small arrays for each thread
+            auto mode = ReduceMode::Local;
+            dr::scatter_add(m_counts, UInt32(1), index, active, mode);
+            dr::scatter_reduce(ReduceOp::Max, m_cells, cell, place, active, mode);
         } else if (active) {
             m_counts[index].fetch_add(1, std::memory_order_relaxed);
             uint32_t before = m_cells[place].load(std::memory_order_relaxed);

@@ -204,7 +204,7 @@ private:
         return light;
     }
 
-    /// Add radiance of the vertex at the end of a piece
+    /// Add radiance of the vertex at the end of a piece, as the camera sees it
     void add(State &s, const Spectrum &radiance, const Piece &piece, Mask active) const {
         Spectrum value = s.throughput * radiance;
         if (m_media)

@@ -59,6 +59,8 @@ std::vector<Aov> read_aovs(const mitsuba::Properties &props) {
     if (!props.has_property(about().name))
         return result;
     std::string text = props.get<std::string>(about().name);
+    if (text == "none") // as the help calls the default
+        return result;
     for (const std::string &each : mitsuba::string::tokenize(text)) {
         Aov aov = read_aov(props, each);
         for (const Aov &other : result)

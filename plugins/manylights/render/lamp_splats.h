@@ -204,7 +204,9 @@ private:
         Interaction3f from(0.f, seen.ray.time, seen.ray.wavelengths, seen.ray.o);
         auto rng         = u.rng();
         MediumPtr medium = m_sensor->medium();
-        return m_media.transmittance(from, Point3f(seen.point.p), medium, rng, active);
+        return m_media.transmittance(
+            from, Point3f(seen.point.p),
+            Mask(may_end_close(seen.row, m_lights.table_kinds())), medium, rng, active);
     }
 
     /// Would a camera ray find it? Nothing before the point will do

@@ -105,11 +105,12 @@ public:
      * Rays start a little off a surface and end a little before the light; pieces in media are
      * measured along the line between the points themselves.
      *
+     * @param close   may rays end close to the second point?
      * @param medium  medium around the first point, null for none
      */
     MI_NOINLINE Spectrum transmittance(const Interaction3f &from, const Point3f &to,
-                                       const MediumPtr &medium, Rng &rng,
-                                       Mask active) const {
+                                       const Mask &close, const MediumPtr &medium,
+                                       Rng &rng, Mask active) const {
         struct State {
             Mask active;
             Ray3f ray;
@@ -122,8 +123,9 @@ public:
         };
         Float distance = dr::norm(to - from.p);
         Vector3f d     = (to - from.p) / distance;
-        State state{ active, shadow_ray(from, to), Float(0.f),
-                     medium, Spectrum(1.f),        std::move(rng) };
+        State state{ active,        shadow_ray(from, to, close),
+                     Float(0.f),    medium,
+                     Spectrum(1.f), std::move(rng) };
         loop(
             state, [](const State &s) { return s.active; },
             [&](State &s) {
@@ -149,7 +151,7 @@ public:
                 s.active &= passes;
                 if (dr::none_or<false>(s.active))
                     return;
-                cross(s, si, to);
+                cross(s, si, to, close);
             },
             "Media: transmittance");
         rng = std::move(state.rng);
@@ -252,13 +254,14 @@ private:
 
     /// Pass the surface that a shadow ray to a point has reached
     template <typename State>
-    void cross(State &s, const SurfaceInteraction3f &si, const Point3f &to) const {
+    void cross(State &s, const SurfaceInteraction3f &si, const Point3f &to,
+               const Mask &close) const {
         BSDFPtr bsdf                   = si.bsdf();
         Spectrum value                 = bsdf->eval_null_transmission(si, s.active);
         value                          = si.to_world_mueller(value, si.wi, si.wi);
         dr::masked(s.result, s.active) = s.result * value;
         // It starts a little aside, so it has to be aimed again
-        Ray3f next                  = shadow_ray<Float, Spectrum>(si, to);
+        Ray3f next                  = shadow_ray<Float, Spectrum>(si, to, close);
         Mask ahead                  = next.maxt > 0.f && dr::dot(next.d, s.ray.d) > 0.f;
         s.medium                    = medium_beyond(si, s.medium, s.ray.d, s.active);
         dr::masked(s.ray, s.active) = next;

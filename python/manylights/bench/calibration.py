@@ -32,7 +32,7 @@ def steady_seconds(measure: Measure, spp: int) -> float:
     return min(seconds, measure(spp)) if spp <= FEW_SAMPLES else seconds
 
 
-def ladder(measure: Measure, budget: float, largest: int | None = None) -> dict[int, float]:
+def ladder(measure: Measure, budget: float, largest: int | None = None) -> dict[int, float]:  # pyright: ignore[reportReturnType]
     """Measure 1, 4, 16, ... samples as long as a render takes at most ``budget`` seconds.
 
     One sample is always measured, and four if they take at most ``SECOND`` budgets: one number

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -65,7 +66,8 @@ def draw_channels(
 def _render(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -> np.ndarray:
     """Render in as many passes as the memory needs; each sample has the same weight."""
     width, height = loaded.size
-    backend, total = mi.variant().split("_")[0], 0.0
+    total: Any = 0.0
+    backend = mi.variant().split("_")[0]
     sensor = loaded.sensors[sampler]
     if backend == "scalar" or spp * width * height <= plans.MOST_STATES:
         return np.array(integrator.render(loaded.scene, sensor, seed, spp))

@@ -20,8 +20,8 @@ def versions() -> dict[str, str]:
 
     return {
         "manylights": __version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
+        "mitsuba": str(mi.__version__),
+        "drjit": str(dr.__version__),  # pyright: ignore[reportAttributeAccessIssue]
         "python": platform.python_version(),
         "numpy": np.__version__,
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +20,8 @@ class Moments:
 
     def __init__(self) -> None:
         self.seeds: list[int] = []
-        self.mean: np.ndarray | float = 0.0
-        self.squares: np.ndarray | float = 0.0
+        self.mean: Any = 0.0
+        self.squares: Any = 0.0
 
     def add(self, seed: int, image: np.ndarray) -> None:
         """Add the image of a seed, unless that is in already."""

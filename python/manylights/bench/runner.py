@@ -469,7 +469,7 @@ def _build_seconds(candidate: Candidate) -> float:
     """Return the seconds in which our integrator built its tree, 0 for Mitsuba's."""
     if not candidate.method.is_ours:
         return 0.0
-    value = mi.traverse(candidate.integrator)["build_ms"]
+    value: Any = mi.traverse(candidate.integrator)["build_ms"]
     return 1e-3 * float(value if isinstance(value, (int, float)) else value[0])
 
 

@@ -105,4 +105,4 @@ def choose(sensors: dict[str, Any], spps: list[int], draw: Callable[[str, int, i
         mean = np.mean([drawing.image for drawing in pair], axis=0)
         errors = metrics.relative_errors(pair[0].image, pair[1].image) if mean.any() else mean
         costs[name] = metrics.trimmed_mean(errors) * min(drawing.seconds for drawing in pair)
-    return min(costs, key=costs.get)
+    return min(costs, key=lambda name: costs[name])

@@ -231,7 +231,7 @@ def _describe(
     except UsageError as error:
         raise UsageError(f"{text}: {error}") from error
     count = sum(lights.count_kinds(scene).values())
-    sensors = dict(zip(samplers.NAMES, scene.sensors()))
+    sensors: dict[str, Any] = dict(zip(samplers.NAMES, scene.sensors()))
     return MeasuredScene(scene, kind, count, media, sensors)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from manylights.errors import UsageError
-from manylights.output import exr
+from manylights.output import channels, exr
 from manylights.rendering import metadata
 
 HELP = """\
@@ -26,5 +26,7 @@ def _run(options) -> None:
     if not any(name.startswith(exr.OURS) for name in attributes):
         raise UsageError(f"{options.image}: no render of manylights, it has no {exr.OURS}* in it")
     print(f"{options.image}: {width} x {height}")
-    print(f"{'channels:':<{metadata.INDENT}}{', '.join(names)}")
+    shown = [name for name in names if not channels.is_sum(name)]
+    sums = " and their sums" if len(shown) < len(names) else ""
+    print(f"{'channels:':<{metadata.INDENT}}{', '.join(shown)}{sums}")
     print("\n".join(metadata.describe(attributes)))

@@ -6,11 +6,17 @@ import argparse
 
 import mitsuba as mi
 
+from manylights.cli import options as shared
 from manylights.output import images
 from manylights.progress import say
 from manylights.rendering.merge import merge
 
 HELP = """\
+examples:
+  manylights merge image.part-*.exr -o image.exr
+  manylights merge image.part-*.exr -o preview.exr --partial
+  manylights merge seed0.exr seed1.exr -o mean.exr
+
 Adds the parts of a render, and writes its image with a PNG preview beside it. The parts are
 those that manylights render --part K/N wrote, checkpoints, or files of earlier mergings. The
 image is that of one render without parts, bit for bit, whatever their number, order and
@@ -43,13 +49,16 @@ def add(commands, common) -> None:
         action="store_true",
         help="add layers denoised.* and show them in the PNG, as manylights render does",
     )
+    shared.add_exposure(parser)
     parser.set_defaults(command=_run)
 
 
 def _run(options) -> None:
     mi.set_variant("scalar_rgb")
     images.check_output(options.output)
-    merged = merge(options.parts, options.output, options.partial, options.denoise)
+    merged = merge(
+        options.parts, options.output, options.partial, options.denoise, options.exposure
+    )
     for note in merged.notes:
         say(note)
     names = " and ".join(str(path) for path in merged.files)

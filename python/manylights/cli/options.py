@@ -17,11 +17,10 @@ VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scala
 
 
 def add_scene(parser) -> None:
-    """Add SCENE and the options that say how it is read; ``defines`` and others give them back."""
+    """Add SCENE and ``-D``; ``defines`` gives that back. How stages are read is ``add_usd``."""
     scene = parser.add_argument("scene", metavar="SCENE", help="XML file or USD stage")
     scene.complete = shtab.FILE
     add_define(parser)
-    add_usd(parser)
 
 
 def add_define(parser) -> None:
@@ -68,6 +67,17 @@ def add_machine(parser) -> None:
     group.add_argument("--seed", type=seed, default=0, help="0 to 4294967295 (default: 0)")
     group.add_argument("--variant", help=VARIANT_HELP)
     group.add_argument("--threads", type=positive, help="CPU threads of the render (default: all)")
+
+
+def add_exposure(parser) -> None:
+    """Add how bright the PNG is."""
+    parser.add_argument(
+        "--exposure",
+        type=stops,
+        default=0.0,
+        metavar="EV",
+        help="stops by which the PNG is brighter (default: 0)",
+    )
 
 
 def defines(options) -> dict[str, str]:
@@ -160,7 +170,7 @@ def stops(text: str) -> float:
     return value
 
 
-def part(text: str) -> Part:
+def part(text: str) -> Part | None:
     """A part of several: 3/16."""
     numbers = text.split("/")
     if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +46,12 @@ The file has one part. Colours and alpha have the film's number format, layers 3
 --aov albedo,normal,position,depth,uv gives albedo.R, normal.X, P.X, Z, uv.U and so on, of
 the surfaces in sight and from the same rays; parameters counts=true gives counts.*;
 --until-noise and --for give variance.*; with layers there is samples. --denoise adds
-denoised.*, best with a box filter, and leaves the image as it is.
+denoised.*, best with a box filter, and leaves the image as it is. --exposure is for the PNG.
+
+--light-groups 'key=lamp_*,windows=facade' gives RGBA_key.R, RGBA_windows.R, RGBA_rest.R and
+so on: the light of emitters whose id, or that of their shape, fits the pattern, and of all
+others. The image is the sum of these layers. manylights mix OUT.exr key=2 windows=0 -o
+OTHER.exr makes the one group brighter and switches the other off, without rendering again.
 
 With --checkpoint the state of the render is kept in OUT.checkpoint.exr, a picture, too,
 after each step that ends SECONDS or more after the last one was written. After a crash, a
@@ -117,6 +123,7 @@ def add(commands, common) -> None:
     )
     _add_layers(parser)
     _add_parts(parser)
+    shared.add_usd(parser)
     shared.add_machine(parser)
     parser.set_defaults(command=_run)
 
@@ -141,13 +148,7 @@ def _add_layers(parser) -> None:
         help="add layers denoised.* by Open Image Denoise and show them in the PNG; implies "
         "--aov albedo,normal,emission (needs manylights[denoise])",
     )
-    group.add_argument(
-        "--exposure",
-        type=shared.stops,
-        default=0.0,
-        metavar="EV",
-        help="stops by which the PNG is brighter (default: 0)",
-    )
+    shared.add_exposure(group)
     group.add_argument(
         "--tev",
         nargs="?",
@@ -213,7 +214,11 @@ def _parameter_help() -> str:
     lines = []
     for plugin, parameters in integrators.PARAMETERS.items():
         lines += ["", f"parameters of {plugin}:"]
-        lines += [f"  {name:<14}  {parameter}" for name, parameter in parameters.items()]
+        width = max(map(len, parameters))
+        for name, parameter in parameters.items():
+            wrapped = textwrap.wrap(str(parameter), 86 - width)
+            names = [name, *[""] * (len(wrapped) - 1)]
+            lines += [f"  {first:<{width}}  {text}" for first, text in zip(names, wrapped)]
     return "\n".join(lines[1:])
 
 

@@ -15,6 +15,7 @@ def add(commands, common) -> None:
         "tree", parents=[common], help="describe the lights of a scene and their tree"
     )
     shared.add_scene(parser)
+    shared.add_usd(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--variant", default="scalar_rgb", help="(default: scalar_rgb)")
     parser.set_defaults(command=_run)

@@ -25,7 +25,7 @@ def describe(verbose: bool) -> str:
         return manylights.__version__
     lines = {
         "manylights": manylights.__version__,
-        "Mitsuba": f"{mi.__version__}, Dr.Jit {dr.__version__}",
+        "Mitsuba": f"{mi.__version__}, Dr.Jit {dr.__version__}",  # pyright: ignore[reportAttributeAccessIssue]
         "Python": f"{platform.python_version()}, {platform.platform()}",
         "packages": ", ".join(map(_package, PACKAGES)),
         "plugins": manylights.plugin_dir(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -71,6 +72,11 @@ def sums(sequences: int) -> list[str]:
     """
     numbers = ["", *(str(number) for number in range(1, sequences))]
     return [f"checkpoint{number}_{part}." for number in numbers for part in SUM_PARTS]
+
+
+def is_sum(name: str) -> bool:
+    """Is this channel a part of the sums that a checkpoint has, and no picture?"""
+    return re.match(rf"checkpoint\d*_({'|'.join(SUM_PARTS)})\.", name) is not None
 
 
 def aov_list(names: str | Sequence[str], option: str = "aovs") -> str:
@@ -190,7 +196,7 @@ def join(channels: list[str], *parts: np.ndarray):
         parts: of shape (height, width, channels).
     """
     # Made of an array, a bitmap calls its channels Y and A or R, G and B.
-    size = [parts[0].shape[1], parts[0].shape[0]]
+    size: Any = [parts[0].shape[1], parts[0].shape[0]]
     kind = mi.Struct.Type.Float32
     bitmap = mi.Bitmap(_formats.MultiChannel, kind, size, len(channels), list(channels))
     pixels = np.array(bitmap, copy=False).reshape(*parts[0].shape[:2], -1)
@@ -218,7 +224,8 @@ def read_colors(path: str | Path, prefix: str = "") -> np.ndarray:
     image = np.stack([planes[name] for name in chosen], axis=-1)
     if chosen == ("X", "Y", "Z"):
         image = image @ TO_RGB.T
-    image = np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
+    # A copy: the view of a broadcast cannot be written, which FLIP insists on
+    image = np.broadcast_to(image, (*image.shape[:2], 3)).copy()
     broken = int(np.sum(~np.isfinite(image).all(axis=2)))
     if broken:
         raise UsageError(f"{prefix}{path}: {broken} pixels are infinite or not a number")

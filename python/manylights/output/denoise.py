@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, one_line
 from manylights.output import channels
 
 #: What the denoiser wants to know of the surfaces in sight, as users name it.
@@ -31,7 +31,9 @@ def check_installed() -> None:
     try:
         import mitsuba_oidn  # noqa: F401
     except ImportError as error:
-        raise UsageError(MISSING) from error
+        # It may be there, and lack something itself
+        absent = getattr(error, "name", None) == "mitsuba_oidn"
+        raise UsageError(MISSING + ("" if absent else f" ({one_line(error)})")) from error
 
 
 def with_guides(names: str | Sequence[str] | None) -> list[str]:
@@ -76,7 +78,8 @@ def denoised(image: np.ndarray, names: list[str], exposure: float = 1.0) -> np.n
     guides = {}
     for guide, letters in zip(GUIDES, ("RGB", "XYZ")):
         wanted = [f"{guide}.{letter}" for letter in letters]
-        if all(name in names for name in wanted):
+        # It takes normals with the albedo alone
+        if all(name in names for name in wanted) and (guide == GUIDES[0] or guides):
             guides[guide] = _planes(image, names, wanted)
     emitted = _emitted(image, names, exposure, color)
     color = np.ascontiguousarray(color - emitted)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from manylights import files
+from manylights.errors import UsageError
 from manylights.output import channels, exr, light_groups
 from manylights.threads import threads_for_files
 
@@ -22,6 +23,16 @@ def check_output(path: str) -> Path:
         UsageError: another ending, no such folder, a folder of that name, or no permission.
     """
     return files.check_output(path, "the image is an OpenEXR file", ".exr")
+
+
+def check_stops(value: float) -> None:
+    """Check the stops by which a PNG is brighter.
+
+    Raises:
+        UsageError: no number from -64 to 64.
+    """
+    if not -64.0 <= value <= 64.0:
+        raise UsageError(f"exposure {value}: must be a number from -64 to 64")
 
 
 def write_images(
@@ -56,7 +67,7 @@ def write_images(
     # Layers of light groups add up to the bit.
     number = np.float32 if light_groups.groups(channels.names(bitmap)) else number
     planes, notes = _planes(bitmap, number)
-    planes |= light_groups.alphas(planes) | (layers or {})
+    planes |= {**light_groups.alphas(planes), **(layers or {})}
     if samples is not None and any(not channels.is_beauty(name) for name in planes):
         # An image alone says so in its attributes
         planes |= channels.samples_layer(next(iter(planes.values())).shape, samples)

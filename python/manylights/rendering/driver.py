@@ -13,6 +13,7 @@ from contextlib import nullcontext
 import mitsuba as mi
 import numpy as np
 
+from manylights.errors import UsageError
 from manylights.loading import LoadedScene
 from manylights.output import channels
 from manylights.rendering.plan import Limits, Step
@@ -60,6 +61,9 @@ class Driver:
             seed: of its sequence.
             spp: samples per pixel of the whole job.
             report: called with the finished fraction of the step.
+
+        Raises:
+            UsageError: it was stopped before its end.
         """
         self._follow(step)
         planned = step.passes and self.plans
@@ -77,6 +81,11 @@ class Driver:
             )
         raw = np.array(self.sensor.film().develop(raw=True))
         report(1.0)
+        # Mitsuba ends a step early after SIGINT also where Python ignores it, as in scripts.
+        if self.integrator.should_stop():
+            raise UsageError(
+                "the render was stopped before its end, by an interrupt or its integrator's timeout"
+            )
         return raw * np.float32(step.spp) if self.adjoint else raw
 
     def blank(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 from manylights import loading
 from manylights.loading import light_groups
 from manylights.loading.integrators import Wish
-from manylights.output import channels
+from manylights.output import channels, images
 from manylights.output import denoise as denoising
 from manylights.rendering import live
 from manylights.rendering.job import Job, check
@@ -59,11 +59,12 @@ class Extras:
             if name not in known:
                 raise TypeError(f"render() got an unexpected keyword argument {name!r}")
         extras = Extras(**arguments)
-        stops, denoise = extras.exposure, extras.denoise
-        check("exposure", stops, -64 <= stops <= 64, "a number from -64 to 64")
-        whole = not denoise or part is None
-        check("denoise", denoise, whole, "left out with part, and given to manylights.merge")
-        if denoise:
+        images.check_stops(extras.exposure)
+        for name in ("denoise", "exposure"):
+            value = getattr(extras, name)
+            whole = not value or part is None
+            check(name, value, whole, "left out with part, and given to manylights.merge")
+        if extras.denoise:
             denoising.check_installed()
         return extras
 

@@ -65,6 +65,7 @@ def merge(
     output: str | Path | None = None,
     partial: bool = False,
     denoise: bool = False,
+    exposure: float = 0.0,
 ) -> Merged:
     """Add parts of one render, in any order and grouping, or average renders of several seeds.
 
@@ -78,12 +79,14 @@ def merge(
         partial: also if parts are missing: the output keeps the sums then, and can be merged again.
         denoise: find the image without noise, too, as ``render`` does; with albedo and normals if
             the files have them. Not of an image that has parts missing.
+        exposure: stops by which the PNG is brighter, from -64 to 64.
 
     Raises:
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
             that comes twice, or one that is missing and ``partial`` is not set.
     """
     target = None if output is None else images.check_output(str(output))
+    images.check_stops(exposure)
     if denoise:
         denoising.check_installed()
     paths = [Path(path) for path in paths]
@@ -91,12 +94,12 @@ def merge(
         raise UsageError("nothing to merge: no files")
     first, bitmap = state_file.read(paths[0], WHAT, "")
     if first.state is None:
-        return _merge_images(first, bitmap, paths[1:], target, denoise)
+        return _merge_images(first, bitmap, paths[1:], target, denoise, exposure)
     del bitmap
     total = _Parts(first)
     for path in paths[1:]:
         total.add(state_file.read(path, WHAT, "")[0])
-    return total.finish(target, partial, denoise)
+    return total.finish(target, partial, denoise, exposure)
 
 
 class _Parts:
@@ -158,7 +161,7 @@ class _Parts:
                 words = run.words(self.steps)
                 raise UsageError(f"{words} comes twice: in {path} and in {saved.path}")
 
-    def finish(self, target: Path | None, partial: bool, denoise: bool) -> Merged:
+    def finish(self, target: Path | None, partial: bool, denoise: bool, stops: float) -> Merged:
         """Make the image, and write it or, if parts are missing, the sums."""
         runs = [run for saved in self.files for run in saved.runs]
         missing = gaps(runs, self.steps)
@@ -175,11 +178,11 @@ class _Parts:
         if missing:
             facts = {**self.facts, "part": MERGED}
             saved = Saved(target, facts, runs, state, self.first.shown, self.first.command)
-            previews, notes = images.write_preview(bitmap, target)
+            previews, notes = images.write_preview(bitmap, target, stops=stops)
             merged.files = [state_file.write(saved), *previews]
         else:
             own = _signature(self.facts, [self.facts["seed"]], samples)
-            notes = _write(merged, target, {}, own, denoise)
+            notes = _write(merged, target, {}, own, denoise, stops)
         merged.notes += notes
         return merged
 
@@ -228,7 +231,9 @@ def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
     return state_file.signature({**own, "part": "1/1", "seeds": seeds}, samples)
 
 
-def _write(merged: Merged, target: Path, layers: dict, own: dict, denoise: bool) -> list[str]:
+def _write(
+    merged: Merged, target: Path, layers: dict, own: dict, denoise: bool, stops: float
+) -> list[str]:
     """Write the image of finished parts or images; return notes about that."""
     names, shown = channels.names(merged.bitmap), None
     if denoise:
@@ -242,13 +247,18 @@ def _write(merged: Merged, target: Path, layers: dict, own: dict, denoise: bool)
         layers = layers | channels.color_layers(channels.DENOISED, shown)
     number = np.float16 if json.loads(own[exr.OURS + "number"]) == "float16" else np.float32
     merged.files, notes = images.write_images(
-        merged.bitmap, target, layers, own, number, merged.samples, shown
+        merged.bitmap, target, layers, own, number, merged.samples, shown, stops
     )
     return notes
 
 
 def _merge_images(
-    first: Saved, planes: dict, paths: list[Path], target: Path | None, denoise: bool
+    first: Saved,
+    planes: dict,
+    paths: list[Path],
+    target: Path | None,
+    denoise: bool,
+    stops: float,
 ) -> Merged:
     """Return the mean of finished images."""
     facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
@@ -283,7 +293,7 @@ def _merge_images(
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
         own = _signature(facts, sorted(owners), samples)
-        merged.notes += _write(merged, target, layers, own, denoise)
+        merged.notes += _write(merged, target, layers, own, denoise, stops)
     return merged
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from typing import Any
 
 import mitsuba as mi
@@ -15,6 +16,9 @@ CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 
 #: What :func:`attributes` adds to the facts of a job.
 OWN = ("samples", "seconds_taken", "parameters", "noise")
+
+#: Facts of parts and checkpoints that are for the program alone.
+HIDDEN = ("learnt", "channels", "shown", "runs")
 
 #: Columns of names in what ``describe`` returns.
 INDENT = 20
@@ -87,11 +91,15 @@ def _projection(sensor, parameters: dict[str, Any]) -> np.ndarray:
 def describe(attributes: dict[str, Any]) -> list[str]:
     """Return the attributes of a file for people, a line or more each, our own first.
 
-    Facts without a value are left out.
+    Facts without a value are left out, and those for the program alone.
     """
     ordered = sorted(attributes.items(), key=lambda item: not item[0].startswith(exr.OURS))
     lines = []
     for name, value in ordered:
+        if name.startswith(exr.OURS) and name.removeprefix(exr.OURS) in HIDDEN:
+            continue
+        if name == f"{exr.OURS}command" and (words := exr.fact(value)):
+            value = shlex.join(["manylights", *words])
         if text := _text(value):
             first, *rest = text.splitlines()
             lines.append(f"{name.removeprefix(exr.OURS) + ':':<{INDENT - 1}} {first}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Union
 
 import numpy as np
 
@@ -17,7 +18,7 @@ OF_THE_RENDER = ("variance.", "denoised.")
 #: Facts about it that are not those of a mix.
 OWN_FACTS = ("noise",)
 
-Weight = float | Sequence[float]
+Weight = Union[float, Sequence[float]]
 
 
 @dataclass
@@ -35,7 +36,12 @@ class Mixed:
     files: list[Path] = field(default_factory=list)
 
 
-def mix(path: str | Path, weights: Mapping[str, Weight], output: str | Path | None = None) -> Mixed:
+def mix(
+    path: str | Path,
+    weights: Mapping[str, Weight],
+    output: str | Path | None = None,
+    exposure: float = 0.0,
+) -> Mixed:
     """Multiply the layers of light groups of a render, and make the image their sum.
 
     All in single precision: each layer is a product, the image the sum of the layers in the order
@@ -46,11 +52,13 @@ def mix(path: str | Path, weights: Mapping[str, Weight], output: str | Path | No
         path: an image that ``render(..., light_groups=...)`` or ``manylights render`` wrote.
         weights: by group: a number, or three for red, green and blue; finite, 0 or more.
         output: file (.exr) to write to, with a PNG beside it. Default: none.
+        exposure: stops by which the PNG is brighter, from -64 to 64.
 
     Raises:
         UsageError: (a ``ValueError``) no render of ours, no such group, a wrong weight.
     """
     target = None if output is None else images.check_output(str(output))
+    images.check_stops(exposure)
     planes, attributes = exr.read(path)
     groups = light_groups.groups(planes)
     _check_file(Path(path), groups, attributes)
@@ -72,7 +80,7 @@ def mix(path: str | Path, weights: Mapping[str, Weight], output: str | Path | No
         mixed.files = [exr.write(target, kept, _signed(attributes, factors))]
         names = [name for name in (*channels.RGB, "A") if name in kept]
         picture = channels.join(names, np.stack([kept[name] for name in names], axis=-1))
-        previews, notes = images.write_preview(picture, target)
+        previews, notes = images.write_preview(picture, target, stops=exposure)
         mixed.files += previews
         mixed.notes += notes
     return mixed

@@ -124,7 +124,7 @@ def render(
         threads: CPU threads, 1 or more. Default: all, on workers those that Dask knows of.
         client: ``distributed.Client``, whose workers render the scene of a file. Default: none.
         ship: send them the files? Default: the workers have these at the same path.
-        extras: ``aovs``, ``light_groups``, ``denoise``, ``exposure``, ``tev``: see ``Extras``.
+        extras: ``aovs``, ``light_groups``, ``denoise``, ``exposure``, ``tev``: those of ``Extras``.
 
     Raises:
         UsageError: (a ``ValueError``) impossible values, files of another render, no worker of use.

@@ -35,11 +35,11 @@ class Sums:
 
     def add(self, *raws: np.ndarray) -> None:
         """Add the raw films of passes, shape (height, width, channels), single precision."""
-        raws = [np.ascontiguousarray(raw, np.float32) for raw in raws]
+        films = [np.ascontiguousarray(raw, np.float32) for raw in raws]
         if self.parts is None:
-            self.parts = np.zeros((PARTS, *raws[0].shape), np.float32)
+            self.parts = np.zeros((PARTS, *films[0].shape), np.float32)
         flat = self.parts.reshape(PARTS, -1)
-        values = [raw.reshape(-1) for raw in raws]
+        values = [raw.reshape(-1) for raw in films]
         # Channels may be infinite.
         with np.errstate(over="ignore", invalid="ignore"):
             for begin in range(0, flat.shape[1], CHUNK):

@@ -3,6 +3,8 @@ places."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from manylights.scenes import _build as build
@@ -29,7 +31,7 @@ def city(
     width: int = 640,
     height: int = 360,
     spp: int = 64,
-    integrator="manylights_direct",
+    integrator: str | Mapping = "manylights_direct",
     texture: bool = False,
 ) -> dict:
     """A street in a city at night, seen from above the roadway.

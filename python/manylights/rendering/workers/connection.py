@@ -107,7 +107,7 @@ def _local_cluster(count: int, threads: int | None, folder: str):
     import dask
     from distributed import LocalCluster
 
-    dask.config.set(LOCAL)
+    dask.config.set(LOCAL)  # pyright: ignore[reportPrivateImportUsage]
     return LocalCluster(
         n_workers=count,
         threads_per_worker=threads or max(dr.thread_count() // count, 1),
