@@ -58,7 +58,10 @@ class ParsedScene:
 
 
 def parse(
-    path: str, defines: dict[str, str] | None = None, usd_options: UsdOptions | None = None
+    path: str,
+    defines: dict[str, str] | None = None,
+    usd_options: UsdOptions | None = None,
+    light_groups: str = "",
 ) -> ParsedScene:
     """Parse a scene, upgraded to this Mitsuba, not transformed. Inside of ``search_beside``.
 
@@ -66,6 +69,7 @@ def parse(
         path: an XML file, or a USD stage if it ends in one of ``USD_ENDINGS``.
         defines: values for the ``<default>`` parameters of XML, by name. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
+        light_groups: of the integrator, for stages, the reader of which merges lamps.
 
     Raises:
         UsageError: there is no such file, usd-core is missing, or ``defines`` for a stage.
@@ -74,17 +78,19 @@ def parse(
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such file")
     if Path(path).suffix.lower() in USD_ENDINGS:
-        return _parse_usd(path, defines or {}, usd_options or UsdOptions())
+        return _parse_usd(path, defines or {}, usd_options or UsdOptions(), light_groups)
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **(defines or {}))
     mi.parser.transform_upgrade(config, state)
     return ParsedScene(config, state, files_of(state))
 
 
-def _parse_usd(path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
+def _parse_usd(
+    path: str, defines: dict[str, str], options: UsdOptions, light_groups: str
+) -> ParsedScene:
     if defines:
         raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
-    description = import_usd(path).load(path, **asdict(options))
+    description = import_usd(path).load(path, light_groups=light_groups, **asdict(options))
     parsed = parse_description(description)
     # A stage composes layers that no node of the scene names.
     parsed.files = [*map(Path, description.files), *files_of(parsed.state)]
