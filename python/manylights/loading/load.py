@@ -66,7 +66,7 @@ def load(
         sampler: ``None`` (``independent`` becomes ours), ``"keep"`` or a plugin's name.
     """
     with search_beside(path), threads_for_files():
-        groups = (settings or {}).get(light_groups.PARAMETER, "")
+        groups = light_groups.as_text((settings or {}).get(light_groups.PARAMETER, ""))
         parsed = parse(path, defines, usd_options, groups)
         loaded = _choose_and_make(parsed, integrator, settings or {}, sampler)
     loaded.choices["define"] = defines or {}

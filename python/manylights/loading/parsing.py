@@ -6,7 +6,7 @@ The ending of the file's name chooses the reader; after it XML and USD go the sa
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,8 @@ MOST_SUBDIVISION = 6
 class UsdOptions:
     """How a USD stage is read: the arguments of ``manylights.usd.load``, which says what each is.
 
-    A new one is added there, here, and in ``cli/options.py``.
+    A new one is added there, here, and in ``cli/options.py`` (which has the groups of lights as an
+    option of the integrator).
     """
 
     time: float | None = None
@@ -36,6 +37,7 @@ class UsdOptions:
     default_light: bool = False
     legacy_lights: bool = False
     blender_light_units: bool = False
+    light_groups: str = ""
 
 
 @dataclass
@@ -69,7 +71,8 @@ def parse(
         path: an XML file, or a USD stage if it ends in one of ``USD_ENDINGS``.
         defines: values for the ``<default>`` parameters of XML, by name. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
-        light_groups: of the integrator, for stages, the reader of which merges lamps.
+        light_groups: of the integrator, for stages, the reader of which merges lamps. Default: those
+            of ``usd_options``.
 
     Raises:
         UsageError: there is no such file, usd-core is missing, or ``defines`` for a stage.
@@ -78,19 +81,19 @@ def parse(
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such file")
     if Path(path).suffix.lower() in USD_ENDINGS:
-        return _parse_usd(path, defines or {}, usd_options or UsdOptions(), light_groups)
+        options = usd_options or UsdOptions()
+        groups = light_groups or options.light_groups
+        return _parse_usd(path, defines or {}, replace(options, light_groups=groups))
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **(defines or {}))
     mi.parser.transform_upgrade(config, state)
     return ParsedScene(config, state, files_of(state))
 
 
-def _parse_usd(
-    path: str, defines: dict[str, str], options: UsdOptions, light_groups: str
-) -> ParsedScene:
+def _parse_usd(path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
     if defines:
         raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
-    description = import_usd(path).load(path, light_groups=light_groups, **asdict(options))
+    description = import_usd(path).load(path, **asdict(options))
     parsed = parse_description(description)
     # A stage composes layers that no node of the scene names.
     parsed.files = [*map(Path, description.files), *files_of(parsed.state)]

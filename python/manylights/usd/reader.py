@@ -103,12 +103,11 @@ def load(
     return result
 
 
-def describe(path, light_groups="", **choices) -> SceneDict:
+def describe(path, **choices) -> SceneDict:
     """Read a stage as :func:`load` does, but each mesh is a ``MeshShape``, not an object yet.
 
     Args:
         path: of the stage.
-        light_groups: as there.
         choices: the other arguments of :func:`load`.
     """
     options = UsdOptions(**choices)
@@ -127,7 +126,7 @@ def describe(path, light_groups="", **choices) -> SceneDict:
             legacy_lights=options.legacy_lights,
             blender_light_units=options.blender_light_units,
         )
-        asked = light_groups or _groups_of_settings(context)
+        asked = options.light_groups or _groups_of_settings(context)
         context.light_groups = LightGroups(as_text(asked))
         skinning.bake(context)
         return _read(context, options.camera, options.default_light)
