@@ -71,8 +71,8 @@ def parse(
         path: an XML file, or a USD stage if it ends in one of ``USD_ENDINGS``.
         defines: values for the ``<default>`` parameters of XML, by name. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
-        light_groups: of the integrator, for stages, the reader of which merges lamps. Default: those
-            of ``usd_options``.
+        light_groups: of the integrator, for stages, the reader of which merges lamps. Default:
+            those of ``usd_options``.
 
     Raises:
         UsageError: there is no such file, usd-core is missing, or ``defines`` for a stage.
