@@ -202,8 +202,13 @@ def _check_groups(driver: Driver) -> None:
     plain = film.class_name() in FILMS and known and known[1] in ("rgb", "rgba")
     if light_groups.of_integrator(driver.integrator) and not plain:
         what = f"has pixel_format {known[1]}" if known else f"is a {film.class_name()}"
+        todo = 'type <string name="pixel_format" value="rgb"/> in an hdrfilm'
+        backend, mono, _ = mi.variant().partition("_mono")
+        if mono:
+            # Mitsuba's films have luminance there, whatever they are told
+            what, todo = f"has no colours in {mi.variant()}", f"--variant {backend}_rgb has them"
         raise UsageError(
-            f"light groups: the film {what}, layers need an hdrfilm with pixel_format rgb or rgba"
+            f"light groups: the film {what}, layers need pixel_format rgb or rgba: {todo}"
         )
 
 
