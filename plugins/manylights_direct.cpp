@@ -178,7 +178,8 @@ has a pattern of its own. An empty plan ends the job.
 **Light groups.** :code:`light_groups` is a list of :code:`group=pattern`, separated by commas. A
 light belongs to the group of the first entry whose pattern (:code:`*`, :code:`?`, :code:`[a-z]`,
 :code:`[!a-z]`) its id fits, or that of its shape; all others are the group :code:`rest`. A group may
-have several entries; there are at most 16 groups. The film gets the channels
+have several entries; there are at most 16 groups. Ids that begin with a slash are paths of a USD stage:
+their last part is an id, too, and what follows :code:`#` tells lights of one path apart. The film gets the channels
 :code:`RGBA_key.R`, :code:`RGBA_key.G`, :code:`RGBA_key.B` and so on, in the order of their names:
 all light that begins in the lamps of the group, from the same samples as the image, which is their
 sum up to rounding. They are red, green and blue in any film. Where visibility is learnt, the

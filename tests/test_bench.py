@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import manylights
 import mitsuba as mi
@@ -679,6 +680,67 @@ def test_a_method_with_broken_pixels_is_left_out(tmp_path, monkeypatch):
     assert scene["skipped"][0]["spec"] == "uniform"
     assert "1 pixels are not finite" in scene["skipped"][0]["why"]
     assert series_by_spec(scene)["resampled_tree"]["points"][0]["seed"] == [1, 2]
+
+
+def test_denoised_images_are_measured_too(tmp_path):
+    pytest.importorskip("mitsuba_oidn")
+    _, data = bench(tmp_path, CITY, *FEW)
+    plain = data["scenes"][0]["series"]
+    _, data = bench(tmp_path, CITY, *FEW, "--denoise")
+    for before, series in zip(plain, data["scenes"][0]["series"]):
+        assert series["points"] == before["points"]
+        assert [point["spp"] for point in series["denoised"]] == [1, 2]
+        for point in series["denoised"]:
+            assert point["seed"] == [1, 2] and set(point) == POINT_KEYS
+        if series["method"] == "power":
+            clean, noisy = (series[kind][0]["error_trimmed"] for kind in ("denoised", "points"))
+            assert np.mean(clean) < 0.7 * np.mean(noisy)
+    before = (tmp_path / "results.json").read_bytes()
+    bench(tmp_path, CITY, *FEW, "--denoise")
+    assert (tmp_path / "results.json").read_bytes() == before
+
+
+def test_the_missing_denoiser_is_named(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    assert_fails(capsys, (CITY, "--denoise", "--out", tmp_path), "mitsuba-oidn")
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+@pytest.mark.parametrize("name", ["uniform", "resampled_tree"])
+def test_the_denoiser_gets_what_is_in_sight(name, alpha, scalar_variant, monkeypatch):
+    lamp = {"type": "rectangle", "emitter": {"type": "area", "radiance": 3.0}}
+    lamp["to_world"] = mi.ScalarTransform4f().translate([0, 0, 1]).scale([1, 0.3, 1])
+    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.4, 0.6]}}
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    film["pixel_format"] = "rgba" if alpha else "rgb"
+    to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
+    sensor = {"type": "perspective", "fov": 30.0, "to_world": to_world, "film": film}
+    wall = {"type": "rectangle", "bsdf": bsdf, "to_world": mi.ScalarTransform4f().scale(3)}
+    other = lamp | {"to_world": mi.ScalarTransform4f().translate([0, 3, 3]).rotate([1, 0, 0], 90)}
+    scene = {"type": "scene", "sensor": sensor, "wall": wall, "lamp": lamp, "other": other}
+    loaded = SimpleNamespace(
+        scene=mi.load_dict(scene), sensors={"own": 0}, size=(8, 8), kind=Kind("direct")
+    )
+    given = {}
+
+    def denoised(image, names):
+        given.update({name: image[..., index] for index, name in enumerate(names)})
+        return image[..., :3]
+
+    monkeypatch.setattr(drawing.denoise, "denoised", denoised)
+    description = methods.integrator_for(Method(name), loaded.kind)
+    guided = mi.load_dict(methods.with_guides(description))
+    image = drawing.draw_denoised(loaded, guided, 4, 1, "own").image
+    names = ["R", "G", "B", "emission.R", "emission.G", "emission.B"]
+    names += ["albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z"]
+    assert list(given) == names
+    np.testing.assert_array_equal(image[..., 0], given["R"])
+    plain = drawing.draw(loaded, mi.load_dict(description), 4, 1, "own").image
+    np.testing.assert_allclose(plain.mean(), image.mean(), rtol=0.3)
+    in_sight = given["emission.G"]
+    assert in_sight[4, 4] == pytest.approx(3.0) and in_sight[0, 4] == 0.0
+    assert given["albedo.B"][0, 4] == pytest.approx(0.6, abs=0.01)
+    assert given["normal.Z"][0, 4] == pytest.approx(1.0, abs=0.01)
 
 
 def test_unknown_generator_is_a_usage_error():

@@ -1,6 +1,7 @@
 """Light groups: layers that sum to the image, and are what their lamps alone would give; mixes."""
 
 import itertools
+from types import SimpleNamespace
 
 import manylights
 import mitsuba as mi
@@ -10,7 +11,7 @@ from manylights import cli
 from manylights.errors import UsageError
 from manylights.loading.light_groups import as_text, entry_of
 from manylights.output import exr, light_groups
-from manylights.rendering import plan
+from manylights.rendering import job, plan
 
 from tests import statistics_tools as tools
 from tests.conftest import require_variant
@@ -385,10 +386,28 @@ def test_objects_and_films_without_colours_have_no_light_groups(scalar):
     with pytest.raises(UsageError, match="light_groups: the scene is made already"):
         manylights.render(mi.load_dict(scene), light_groups="key=lamp_*")
     scene["camera"]["film"]["pixel_format"] = "luminance"
-    with pytest.raises(UsageError, match="has pixel_format y, layers need"):
+    with pytest.raises(UsageError, match=r'format y, layers need .*"pixel_format" value="rgb"/>'):
         manylights.render(scene, light_groups="key=lamp_*", spp=1)
     with pytest.raises(UsageError, match="path has none"):
         manylights.render(stage() | lamps(), integrator="path", light_groups="key=lamp_*", spp=1)
+
+
+@pytest.mark.parametrize("variant", ["scalar_mono", "llvm_ad_mono", "llvm_ad_mono_polarized"])
+def test_variants_without_colours_say_which_have_them(variant):
+    if variant not in mi.variants():
+        pytest.skip(f"Mitsuba has no {variant}")
+    before = mi.variant()
+    mi.set_variant(variant)
+    try:
+        film = mi.load_dict({"type": "hdrfilm", "pixel_format": "rgb"})
+        driver = SimpleNamespace(
+            integrator='light_groups = "key=lamp_*"', sensor=SimpleNamespace(film=lambda: film)
+        )
+        colored = variant.partition("_mono")[0] + "_rgb"
+        with pytest.raises(UsageError, match=f"no colours in {variant}, .*--variant {colored} has"):
+            job._check_groups(driver)
+    finally:
+        mi.set_variant(before or "scalar_rgb")
 
 
 # -------------------------------------------------------------------------------- Noise

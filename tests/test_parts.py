@@ -11,10 +11,10 @@ import manylights
 import mitsuba as mi
 import numpy as np
 import pytest
-from manylights import cli
+from manylights import cli, loading
 from manylights.errors import UsageError
 from manylights.output import exr
-from manylights.rendering import plan, state_file
+from manylights.rendering import job, plan, state_file
 from manylights.rendering.driver import Driver
 from manylights.rendering.parts import Part, Run, gaps, steps_of
 from manylights.rendering.plan import Limits
@@ -586,3 +586,37 @@ def test_other_processors_are_told(run, parts, monkeypatch, tmp_path):
     assert run("--part", "2/2")[0] == 0
     status, log = run.merge(*tmp_path.glob("a.part-*.exr"))
     assert status == 0 and "processors: rendered on 2 types" in log and "Abacus 9" in log
+
+
+def many_shapes():
+    """Return a scene of which Mitsuba makes six meshes, in an order by chance."""
+    scene = {"type": "scene", "sensor": {"type": "perspective"}}
+    scene["integrator"] = {"type": "manylights_direct"}
+    for group in range(6):
+        grey = {"type": "rgb", "value": 0.1 + 0.1 * group}
+        bsdf = {"type": "diffuse", "reflectance": grey}
+        for index in range(40):
+            place = mi.ScalarTransform4f().translate([group, index, 0])
+            scene[f"floor_{group}_{index}"] = {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+        scene[f"ball_{group}"] = {"type": "sphere", "bsdf": bsdf}
+        scene[f"lamp_{group}"] = {"type": "sphere", "emitter": {"type": "area", "radiance": grey}}
+    return scene
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_same_dictionary_is_the_same_scene(variant):
+    require_variant(variant)
+
+    def digest(scene):
+        return job._digest(loading.as_loaded(scene)[0].scene)
+
+    first = digest(many_shapes())
+    assert all(digest(many_shapes()) == first for _ in range(7))
+    for name, other, part in [
+        ("lamp_0", "lamp_1", "emitter"),
+        ("floor_0_0", "floor_1_0", "bsdf"),
+        ("ball_0", "ball_1", "bsdf"),
+    ]:
+        scene = many_shapes()
+        scene[name][part], scene[other][part] = scene[other][part], scene[name][part]
+        assert digest(scene) != first

@@ -257,6 +257,25 @@ def test_charts_have_stable_names(folder):
         assert {f"{stem}.svg", f"{stem}.png"} <= names
 
 
+def test_denoised_images_have_a_chart(tmp_path):
+    data = report_data.write_results(tmp_path)
+    scene = data["scenes"][0]
+    for series in scene["series"]:
+        if series["spec"] in ("resampled_tree", "power"):
+            series["denoised"] = json.loads(json.dumps(series["points"]))
+            for point in series["denoised"]:
+                point["seconds"] = [2 * seconds for seconds in point["seconds"]]
+                point["error_trimmed"] = [0.1 * error for error in point["error_trimmed"]]
+    (tmp_path / "results.json").write_text(json.dumps(data))
+    found = records.load(tmp_path)
+    drawn = charts.draw_all(found, {}, tmp_path / "charts")["denoised"]
+    assert [chart.name for chart in drawn] == [f"denoised_{scene['name']}"]
+    last = next(series for series in found.scenes[0].series if series.ours).denoised[-1]
+    assert f"{last.error_trimmed.mean():.2g} in {last.seconds.mean():.2g} s" in drawn[0].alt
+    text, _ = page.render(found, publish=False)
+    assert '<section id="denoised">' in text
+
+
 def test_readme_has_the_tables(folder):
     """Beside the results, with the charts that there are, and without what is private."""
     readme = (folder / "README.md").read_text()

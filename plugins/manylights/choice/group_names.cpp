@@ -44,6 +44,17 @@ bool has_open_set(std::string_view pattern) {
     return false;
 }
 
+/// Does the name of a light fit? Of a path of a USD stage the last part does, too, and what
+/// follows # tells several lights of a prim apart.
+bool fits_light(std::string_view pattern, std::string_view name) {
+    if (fits(pattern, name))
+        return true;
+    if (name.empty() || name[0] != '/')
+        return false;
+    name = name.substr(0, name.find('#'));
+    return fits(pattern, name) || fits(pattern, name.substr(name.rfind('/') + 1));
+}
+
 [[noreturn]] void refuse(const std::string &what) { throw std::invalid_argument(what); }
 
 GroupNames::Entry read_entry(const std::string &text) {
@@ -112,8 +123,8 @@ GroupNames::GroupNames(const std::string &text) : m_text(text) {
 
 size_t GroupNames::entry_of(std::string_view name, std::string_view other) const {
     size_t i = 0;
-    while (i < m_entries.size() && !fits(m_entries[i].pattern, name) &&
-           !fits(m_entries[i].pattern, other))
+    while (i < m_entries.size() && !fits_light(m_entries[i].pattern, name) &&
+           !fits_light(m_entries[i].pattern, other))
         ++i;
     return i;
 }

@@ -3,7 +3,8 @@
 /**
  * Groups of lights, as users name them: "key=lamp_*,windows=facade". A light belongs to the first
  * entry one of whose names fits; all others are the group `rest`. Patterns are those of file
- * names: *, ?, [a-z] and [!a-z]. Plain C++, no Dr.Jit and no Mitsuba types.
+ * names: *, ?, [a-z] and [!a-z]; * fits / too. Of names that are paths (of USD) the last part is
+ * a name, too. Plain C++, no Dr.Jit and no Mitsuba types.
  */
 
 #include <cstddef>

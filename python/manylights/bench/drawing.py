@@ -11,6 +11,7 @@ import numpy as np
 
 from manylights.bench.scene_source import MeasuredScene
 from manylights.errors import UsageError
+from manylights.output import channels, denoise
 from manylights.rendering import plan as plans
 
 #: Channels of a pixel that are colours, by the number of channels: with or without alpha.
@@ -51,6 +52,33 @@ def draw(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -
     broken = int(np.sum(~np.isfinite(image).all(axis=2)))
     if broken:
         raise BrokenImage(f"{broken} pixels are not finite at {spp} spp with seed {seed}")
+    return Drawing(image, seconds, cpu_seconds)
+
+
+def draw_denoised(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -> Drawing:
+    """Render a scene with what the denoiser wants to know, and denoise that: as ``draw``.
+
+    Args:
+        loaded: the scene.
+        integrator: of a dictionary of ``methods.with_guides``.
+        spp: samples per pixel, at least 1.
+        seed: of the random numbers.
+        sampler: one that the scene has.
+    """
+    start, cpu_start = time.perf_counter(), time.process_time()
+    pixels = _render(loaded, integrator, spp, seed, sampler)
+    guides = len(denoise.GUIDES) * 3
+    # What Mitsuba's aov nests has as many channels as the image, whatever their names.
+    nested = f"{denoise.EMISSION}.A" in integrator.aov_names()
+    count = (pixels.shape[2] - guides) // 2 if nested else pixels.shape[2] - guides - 3
+    colors, emission = _colors(pixels[..., :count]), _colors(pixels[..., count:-guides])
+    if not np.isfinite(colors).all():
+        raise BrokenImage(f"pixels are not finite at {spp} spp with seed {seed}")
+    names = [f"{denoise.EMISSION}.{letter}" for letter in channels.RGB]
+    names = [*channels.RGB, *names, *integrator.aov_names()[-guides:]]
+    guided = np.concatenate([colors, emission, pixels[..., -guides:]], axis=2)
+    image = denoise.denoised(guided, names)
+    seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
     return Drawing(image, seconds, cpu_seconds)
 
 

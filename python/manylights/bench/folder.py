@@ -150,7 +150,12 @@ def is_skipped(entry: dict[str, Any], method: Method) -> bool:
 def _without_empty_points(entry: dict[str, Any]) -> dict[str, Any]:
     """Return a scene's entry without numbers of samples that are planned and not yet rendered."""
     series = [
-        {**item, "points": [point for point in item["points"] if point["seed"]]}
+        item
+        | {
+            kind: [point for point in item[kind] if point["seed"]]
+            for kind in ("points", "denoised")
+            if item.get(kind)
+        }
         for item in entry["series"]
     ]
     return {**entry, "series": series}

@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from manylights.errors import UsageError, one_line
 from manylights.loading import integrators
+from manylights.output import channels, denoise
 
 
 @dataclass(frozen=True)
@@ -203,6 +204,20 @@ def integrator_for(method: Method, kind: Kind) -> dict[str, Any]:
     if not method.is_ours:
         return {"type": kind.peer, **kind.parameters}
     return {"type": kind.ours, "method": method.name, **method.parameters, **kind.parameters}
+
+
+def with_guides(integrator: dict[str, Any]) -> dict[str, Any]:
+    """Return the dictionary of an integrator that also gives what the denoiser wants to know.
+
+    Ours has the parameter ``aovs``; Mitsuba's are nested in its ``aov``, with paths that end at the
+    first surface for the emission in sight.
+    """
+    if integrator["type"] in integrators.PARAMETERS:
+        return {**integrator, "aovs": channels.aov_list((denoise.EMISSION, *denoise.GUIDES))}
+    peer = "path" if integrator["type"] == "direct" else integrator["type"]
+    sight = {**integrator, "type": peer, "max_depth": 1}
+    aovs = channels.aov_list(denoise.GUIDES)
+    return {"type": "aov", "aovs": aovs, "inner": integrator, denoise.EMISSION: sight}
 
 
 def _value(name: str, text: str) -> Any:

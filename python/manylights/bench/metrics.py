@@ -63,6 +63,7 @@ def flip_error(image: np.ndarray, reference: np.ndarray) -> float:
         UsageError: the package flip-evaluator is not installed.
     """
     flip = extras.require("flip_evaluator", "flip-evaluator")
-    pair = [np.ascontiguousarray(array, dtype=np.float32) for array in (reference, image)]
+    # Copies: arrays that may not be written to are refused
+    pair = [np.array(array, dtype=np.float32, order="C") for array in (reference, image)]
     _, mean, _ = flip.evaluate(*pair, "HDR", applyMagma=False)
     return float(mean)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,7 @@ SERIES = {
     "first_seconds": NUMBER,
     "equal_time": Maybe(EQUAL_TIME),
     "points": [POINT],
+    "denoised": Maybe([POINT]),
 }
 REFERENCE = {
     "integrator": str,
@@ -116,7 +117,11 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One method with its parameters in one scene; points with rising numbers of samples."""
+    """One method with its parameters in one scene; points with rising numbers of samples.
+
+    Those of denoised images are of renders of their own, with albedo and normals, and their times
+    include the denoiser's.
+    """
 
     spec: str
     method: str
@@ -126,6 +131,7 @@ class Series:
     first_seconds: float
     equal_time: dict[str, Any] | None
     points: list[Point]
+    denoised: list[Point] = field(default_factory=list)
 
     @property
     def key(self) -> str:
@@ -300,8 +306,9 @@ def _check_scene(scene: dict[str, Any], where: str) -> None:
     for index, series in enumerate(scene["series"]):
         place = f"{where}.series[{index}]"
         _check_name(series["spec"], SPEC, f"{place}.spec")
-        for number, point in enumerate(series["points"]):
-            _check_point(point, f"{place}.points[{number}]")
+        for kind in ("points", "denoised"):
+            for number, point in enumerate(series.get(kind) or ()):
+                _check_point(point, f"{place}.{kind}[{number}]")
     _check_distinct([series["spec"] for series in scene["series"]], f"{where}.series")
 
 
@@ -346,11 +353,18 @@ def _scene(folder: Path, entry: dict[str, Any], remarks: list[str]) -> Scene | N
 
 def _series(entry: dict[str, Any], scene: str, remarks: list[str]) -> Series:
     """Return a series with the points that have logarithms."""
-    points = [_point(point) for point in entry["points"] if _is_positive(point)]
+    points = _points(entry["points"])
     if len(points) < len(entry["points"]) or not points:
         remarks.append(f"{scene}, {entry['spec']}: points not rendered yet, or with error 0")
-    points.sort(key=lambda point: point.spp)
-    return Series(**_known(Series, entry), points=points)
+    return Series(
+        **_known(Series, entry), points=points, denoised=_points(entry.get("denoised") or [])
+    )
+
+
+def _points(entries: list[dict[str, Any]]) -> list[Point]:
+    """Return the points that have logarithms, by rising numbers of samples."""
+    points = [_point(entry) for entry in entries if _is_positive(entry)]
+    return sorted(points, key=lambda point: point.spp)
 
 
 def _is_positive(point: dict[str, Any]) -> bool:
@@ -368,5 +382,5 @@ def _known(kind: type, entry: dict[str, Any]) -> dict[str, Any]:
 
     They are None where the entry has none.
     """
-    made = ("folder", "scenes", "series", "points", "remarks")
+    made = ("folder", "scenes", "series", "points", "denoised", "remarks")
     return {one.name: entry.get(one.name) for one in fields(kind) if one.name not in made}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -19,9 +19,9 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.bench import calibration, metrics, records, reference, samplers
-from manylights.bench.drawing import BrokenImage, Drawing, draw, draw_channels
+from manylights.bench.drawing import BrokenImage, Drawing, draw, draw_channels, draw_denoised
 from manylights.bench.folder import Folder, is_skipped, series_of, skip, unskip
-from manylights.bench.methods import EXHAUSTIVE_LIGHTS, Method, integrator_for
+from manylights.bench.methods import EXHAUSTIVE_LIGHTS, Method, integrator_for, with_guides
 from manylights.bench.moments import Moments
 from manylights.bench.scene_source import MeasuredScene, Source
 from manylights.bench.workload import Workload
@@ -81,11 +81,13 @@ class Settings:
         spp: numbers of samples, in rising order; None: 1, 4, 16, ... as the budget allows.
         budget: seconds of the longest render.
         seeds: number of seeds, from 1 on.
+        denoise: measure denoised images, too?
     """
 
     spp: list[int] | None
     budget: float
     seeds: int
+    denoise: bool = False
 
 
 @dataclass
@@ -149,6 +151,8 @@ class SceneRun:
         self.reference = np.zeros(0)
         # Methods whose tree would be built again by the next render.
         self.stale: set[str] = set()
+        # Methods and numbers of samples that have the kernels for denoised images.
+        self.warm: set[tuple[str, int]] = set()
 
     def run(self) -> None:
         """Do everything that is missing."""
@@ -188,11 +192,11 @@ class SceneRun:
             equal_time=self.settings.budget,
         )
 
-    def _draw(self, candidate: Candidate, spp: int, seed: int) -> Drawing:
+    def _draw(self, candidate: Candidate, spp: int, seed: int, draw=draw) -> Drawing:
         method = candidate.method
         try:
             if method.name == "power":
-                return self._draw_by_power(candidate, spp, seed)
+                return self._draw_by_power(candidate, spp, seed, draw)
             if method.spec in self.stale:
                 draw(self.loaded, candidate.integrator, 1, CALIBRATION_SEED, candidate.sampler)
                 self.stale.discard(method.spec)
@@ -201,7 +205,7 @@ class SceneRun:
             where = f"{self.entry['name']}, {method.spec}"
             raise UsageError(f"{where}: {one_line(error)}") from error
 
-    def _draw_by_power(self, candidate: Candidate, spp: int, seed: int) -> Drawing:
+    def _draw_by_power(self, candidate: Candidate, spp: int, seed: int, draw) -> Drawing:
         scene = self.loaded.scene
         with power_sampling(scene, self.weights):
             drawing = draw(self.loaded, candidate.integrator, spp, seed, candidate.sampler_of(spp))
@@ -336,8 +340,14 @@ class SceneRun:
     def _measure_all(self, candidates: list[Candidate]) -> None:
         for seed in range(1, self.settings.seeds + 1):
             for candidate in list(candidates):
-                if not self._attempt(candidate, lambda c, seed=seed: self._measure(c, seed)):
-                    candidates.remove(candidate)
+                steps = [
+                    self._measure,
+                    *([self._measure_denoised] if self.settings.denoise else []),
+                ]
+                for step in steps:
+                    if not self._attempt(candidate, lambda c, s=seed, step=step: step(c, s)):
+                        candidates.remove(candidate)
+                        break
                 self.work.finish(self.task.source.text, self._group_seconds(candidate))
 
     def _measure(self, candidate: Candidate, seed: int) -> None:
@@ -353,6 +363,25 @@ class SceneRun:
             self._add_moments(candidate, seed, drawings[-1].image)
         if series_of(self.entry, candidate.method) is None:
             self.entry["series"].append(series)
+        self.found.save()
+
+    def _measure_denoised(self, candidate: Candidate, seed: int) -> None:
+        """Do the same with denoised images, the renders of which have albedo and normals, too."""
+        points = candidate.series.setdefault("denoised", [])
+        known = {point["spp"] for point in points}
+        points += [records.new_point(spp) for spp in candidate.spps if spp not in known]
+        points.sort(key=lambda point: point["spp"])
+        missing = [point for point in points if seed not in point["seed"]]
+        if not missing:
+            return
+        description = with_guides(integrator_for(candidate.method, self.loaded.kind))
+        guided = replace(candidate, integrator=mi.load_dict(description))
+        for point in missing:
+            key = candidate.method.spec, point["spp"]
+            if key not in self.warm:
+                self._draw(guided, point["spp"], CALIBRATION_SEED, draw_denoised)
+                self.warm.add(key)
+            self._note(point, seed, self._draw(guided, point["spp"], seed, draw_denoised))
         self.found.save()
 
     def _note(self, point: dict[str, Any], seed: int, drawing: Drawing) -> None:
@@ -490,5 +519,8 @@ def _is_finished(entry: dict[str, Any], methods: list[Method], settings: Setting
             return False
         counts = {point["spp"]: len(point["seed"]) for point in series["points"]}
         if min(counts.values()) < settings.seeds or set(settings.spp or ()) - set(counts):
+            return False
+        denoised = {point["spp"]: len(point["seed"]) for point in series.get("denoised") or ()}
+        if settings.denoise and min(denoised.get(spp, 0) for spp in counts) < settings.seeds:
             return False
     return True

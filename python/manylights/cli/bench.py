@@ -18,6 +18,7 @@ from manylights.bench import (
 )
 from manylights.cli import options as shared
 from manylights.errors import UsageError
+from manylights.output import denoise
 from manylights.progress import run_with_bar, say
 
 HELP = """\
@@ -72,6 +73,12 @@ def add(commands, common) -> None:
         help="of one render (default: 0.5, with --quick 0.15)",
     )
     parser.add_argument("--seeds", type=_seeds, default=10, help="number of seeds (default: 10)")
+    parser.add_argument(
+        "--denoise",
+        action="store_true",
+        help="measure denoised images, too, from renders with albedo and normals (needs "
+        "manylights[denoise])",
+    )
     parser.add_argument("--variant", help=shared.VARIANT_HELP)
     parser.add_argument(
         "--reference",
@@ -104,11 +111,13 @@ def _add_scenes(parser) -> None:
 
 def _run(options) -> None:
     extras.require("flip_evaluator", "flip-evaluator")
+    if options.denoise:
+        denoise.check_installed()
     variant = loading.set_variant(options.variant)
     say(f"variant: {variant}")
     tasks = _tasks(options)
     found = folder.open_folder(options.out, variant)
-    settings = runner.Settings(options.spp, _budget(options), options.seeds)
+    settings = runner.Settings(options.spp, _budget(options), options.seeds, options.denoise)
     run_with_bar(
         "measuring",
         lambda bar: runner.run(tasks, settings, found, bar.report),

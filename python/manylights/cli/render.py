@@ -140,7 +140,9 @@ def _add_layers(parser) -> None:
         "--light-groups",
         metavar="NAME=PATTERN,...",
         help="write the light of groups of lamps to layers, by the ids of emitters or shapes: "
-        "key=lamp_*,windows=facade (the others are the group rest); see manylights mix",
+        "key=lamp_*,windows=facade (the others are the group rest), of USD by the paths of prims "
+        "or of their instancers, or by names: key=/World/Lamps/* (* fits / too); see manylights "
+        "mix",
     )
     group.add_argument(
         "--denoise",

@@ -50,8 +50,14 @@ def of_integrator(integrator) -> str:
 def entry_of(groups: str, *names: str) -> int | None:
     """Return the number of the entry that a light with these names belongs to, None for none.
 
+    Of paths of prims, which begin with ``/``, the last part is a name, too, and what follows ``#``
+    tells several lights of a prim apart.
+
     Of a text that is wrong anything; the plugins refuse it.
     """
+    for path in [name for name in names if name.startswith("/")]:
+        path = path.partition("#")[0]
+        names = (*names, path, path.rpartition("/")[2])
     for index, entry in enumerate(groups.split(",")):
         pattern = entry.partition("=")[2]
         if any(fnmatchcase(name, pattern) for name in names):

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 
 from manylights.errors import UsageError
-from manylights.loading import integrators, merging, samplers
+from manylights.loading import integrators, light_groups, merging, samplers
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
@@ -66,7 +66,8 @@ def load(
         sampler: ``None`` (``independent`` becomes ours), ``"keep"`` or a plugin's name.
     """
     with search_beside(path), threads_for_files():
-        parsed = parse(path, defines, usd_options)
+        groups = light_groups.as_text((settings or {}).get(light_groups.PARAMETER, ""))
+        parsed = parse(path, defines, usd_options, groups)
         loaded = _choose_and_make(parsed, integrator, settings or {}, sampler)
     loaded.choices["define"] = defines or {}
     if usd_options is not None and usd_options != UsdOptions():

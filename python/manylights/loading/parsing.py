@@ -6,7 +6,7 @@ The ending of the file's name chooses the reader; after it XML and USD go the sa
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,8 @@ MOST_SUBDIVISION = 6
 class UsdOptions:
     """How a USD stage is read: the arguments of ``manylights.usd.load``, which says what each is.
 
-    A new one is added there, here, and in ``cli/options.py``.
+    A new one is added there, here, and in ``cli/options.py`` (which has the groups of lights as an
+    option of the integrator).
     """
 
     time: float | None = None
@@ -36,6 +37,7 @@ class UsdOptions:
     default_light: bool = False
     legacy_lights: bool = False
     blender_light_units: bool = False
+    light_groups: str = ""
 
 
 @dataclass
@@ -58,7 +60,10 @@ class ParsedScene:
 
 
 def parse(
-    path: str, defines: dict[str, str] | None = None, usd_options: UsdOptions | None = None
+    path: str,
+    defines: dict[str, str] | None = None,
+    usd_options: UsdOptions | None = None,
+    light_groups: str = "",
 ) -> ParsedScene:
     """Parse a scene, upgraded to this Mitsuba, not transformed. Inside of ``search_beside``.
 
@@ -66,6 +71,8 @@ def parse(
         path: an XML file, or a USD stage if it ends in one of ``USD_ENDINGS``.
         defines: values for the ``<default>`` parameters of XML, by name. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
+        light_groups: of the integrator, for stages, the reader of which merges lamps. Default:
+            those of ``usd_options``.
 
     Raises:
         UsageError: there is no such file, usd-core is missing, or ``defines`` for a stage.
@@ -74,7 +81,9 @@ def parse(
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such file")
     if Path(path).suffix.lower() in USD_ENDINGS:
-        return _parse_usd(path, defines or {}, usd_options or UsdOptions())
+        options = usd_options or UsdOptions()
+        groups = light_groups or options.light_groups
+        return _parse_usd(path, defines or {}, replace(options, light_groups=groups))
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **(defines or {}))
     mi.parser.transform_upgrade(config, state)

@@ -27,7 +27,8 @@ class Extras:
             ``shape_index``, ``prim_index``, ``dp_du``, ``dp_dv``, ``duv_dx``, ``duv_dy``,
             ``emission``. For scenes that are not loaded yet. Default: none.
         light_groups: groups of lights by patterns of ids, as ``"key=lamp_*,windows=facade"`` or
-            ``{"key": "lamp_*", "windows": ["facade", "pane_?"]}``: the image gets layers
+            ``{"key": "lamp_*", "windows": ["facade", "pane_?"]}``, in USD stages of paths of prims,
+            as ``"key=/World/Lamps/*"``, or of their names: the image gets layers
             ``RGBA_key.R``, ... with their light, and is the sum of them, bit for bit
             (``output.light_groups``). All other lights are the group ``rest``. For scenes that are
             not loaded yet. Default: what the integrator says.

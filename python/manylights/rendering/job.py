@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -201,8 +202,13 @@ def _check_groups(driver: Driver) -> None:
     plain = film.class_name() in FILMS and known and known[1] in ("rgb", "rgba")
     if light_groups.of_integrator(driver.integrator) and not plain:
         what = f"has pixel_format {known[1]}" if known else f"is a {film.class_name()}"
+        todo = 'type <string name="pixel_format" value="rgb"/> in an hdrfilm'
+        backend, mono, _ = mi.variant().partition("_mono")
+        if mono:
+            # Mitsuba's films have luminance there, whatever they are told
+            what, todo = f"has no colours in {mi.variant()}", f"--variant {backend}_rgb has them"
         raise UsageError(
-            f"light groups: the film {what}, layers need an hdrfilm with pixel_format rgb or rgba"
+            f"light groups: the film {what}, layers need pixel_format rgb or rgba: {todo}"
         )
 
 
@@ -222,15 +228,46 @@ def _digests(paths: list[Path]) -> dict[str, str]:
 
 
 def _digest(scene) -> str:
-    """Return SHA-256 of all parameters of a scene that came from no file."""
+    """Return SHA-256 of all parameters of a scene that came from no file.
+
+    The order of the shapes does not matter: that of meshes that Mitsuba has merged is by chance.
+    """
+    shapes, known = scene.shapes(), {}
+    # Objects without an id have their address in the name.
+    owned = (*(f"{shape.id()}." for shape in shapes if shape.id()), "object_")
+    parts = [_digest_of(scene, lambda name: not name.startswith(owned))]
+    parts += sorted(_digest_of_shape(shape, known) for shape in shapes)
+    return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+
+def _digest_of_shape(shape, known: dict[int, tuple]) -> str:
+    """Return SHA-256 of a shape and its parts; ``known`` has those that others share, too."""
+    children = {
+        "bsdf": shape.bsdf(),
+        "emitter": shape.emitter(),
+        "interior_medium": shape.interior_medium(),
+        "exterior_medium": shape.exterior_medium(),
+    }
+    inside = tuple(f"{name}." for name in children)
+    parts = [shape.id(), _digest_of(shape, lambda name: not name.startswith(inside))]
+    for name, child in children.items():
+        if child is not None:
+            if id(child) not in known:
+                known[id(child)] = child, _digest_of(child, lambda _: True)
+            parts.append(f"{name} {known[id(child)][1]}")
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()
+
+
+def _digest_of(part, chosen: Callable[[str], bool]) -> str:
+    """Return SHA-256 of those parameters of an object of which the names are chosen."""
     digest = hashlib.sha256()
-    parameters = mi.traverse(scene)
-    for name, value in parameters:
+    parameters = mi.traverse(part)
+    for name in filter(chosen, parameters.keys()):
         *_, flags = parameters.properties[name]
         # Renders themselves change these.
         if flags & mi.ParamFlags.ReadOnly or name.endswith(ENTRIES):
             continue
-        # Objects without an id have their address in the name.
+        value = parameters[name]
         digest.update(f"{name.rpartition('.')[2]} {type(value).__name__} ".encode())
         try:
             digest.update(np.ascontiguousarray(getattr(value, "matrix", value)).tobytes())

@@ -10,7 +10,7 @@ import io
 import math
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from manylights.bench.methods import ABOUT, SWEPT
-from manylights.bench.records import Results, Scene, Series
+from manylights.bench.records import Point, Results, Scene, Series
 from manylights.loading.integrators import value_text
 from manylights.report import grouping
 from manylights.report.statistics import (
@@ -97,6 +97,7 @@ def draw_all(results: Results, deviations: Deviations, folder: Path) -> dict[str
     kinds = {
         "overview": _overview,
         "error_time": _error_times,
+        "denoised": _denoised,
         "reach": _reaches,
         "lights": _light_counts,
         "sweeps": _sweeps,
@@ -217,10 +218,50 @@ def _error_line(axes, series: Series, scene: Scene, dash: str, label: str) -> Li
     return Line2D([], [], linestyle=dash, label=label, **look)
 
 
-def _finish_error_time(axes, scene: Scene) -> list[Line2D]:
-    """Scale the axes and add the guide and the reference's error; return these for the legend."""
+def _denoised(results: Results) -> Iterator[tuple]:
+    """Error against time of denoised images, and as thin lines of the same without denoising."""
+    for scene in results.scenes:
+        pairs = [series for series in grouping.one_a_method(scene) if series.denoised]
+        if not pairs:
+            continue
+        figure, axes = _figure()
+        handles = []
+        for series in pairs:
+            label, color = grouping.label(series), _look(series.method)[0]
+            times = [point.seconds.mean() for point in series.points]
+            errors = [error_interval(point).value for point in series.points]
+            axes.plot(times, errors, color=color, linewidth=1.0, alpha=0.7, linestyle=":")
+            clean = replace(series, points=series.denoised)
+            handles.append(_error_line(axes, clean, scene, "-", label))
+        points = [point for series in pairs for point in (*series.points, *series.denoised)]
+        handles += _finish_error_time(axes, scene, points)
+        handles.append(Line2D([], [], color="#555555", linewidth=1.0, linestyle=":", label="noisy"))
+        if any(is_limited(point, scene) for series in pairs for point in series.denoised):
+            handles.append(_hollow("limited by the reference"))
+        axes.set(xlabel=TIME, ylabel=ERROR)
+        _legend(figure, handles)
+        alt = f"Error against time of denoised images in {scene.title}: {_denoised_ends(pairs)}."
+        yield f"denoised_{scene.name}", f"{scene.title}, denoised", alt, figure
+
+
+def _denoised_ends(pairs: list[Series]) -> str:
+    """The longest renders of a chart in words."""
+    texts = []
+    for series in pairs:
+        noisy, clean = series.points[-1].error_trimmed, series.denoised[-1].error_trimmed
+        seconds = series.denoised[-1].seconds.mean()
+        name = grouping.label(series)
+        texts.append(f"{name} {clean.mean():.2g} in {seconds:.2g} s ({noisy.mean():.2g} noisy)")
+    return "; ".join(texts)
+
+
+def _finish_error_time(axes, scene: Scene, points: list[Point] | None = None) -> list[Line2D]:
+    """Scale the axes and add the guide and the reference's error; return these for the legend.
+
+    The points are those of the series that charts show, if no others are given.
+    """
     axes.set(xscale="log", yscale="log")
-    points = [point for series in grouping.shown(scene) for point in series.points]
+    points = points or [point for series in grouping.shown(scene) for point in series.points]
     times = np.array([point.seconds.mean() for point in points])
     errors = np.array([point.error_trimmed.mean() for point in points])
     # Bands may reach far: limits follow the means, with a margin of a third of a decade.

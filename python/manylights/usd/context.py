@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 from pxr import Usd, UsdGeom
 
+from manylights.usd.light_groups import LightGroups
+
 
 @dataclass
 class Note:
@@ -55,6 +57,7 @@ class Context:
         subdivision: levels for meshes without an authored scheme; ``None``: the cage.
         legacy_lights: read the inputs of lights from before USD 21.05?
         blender_light_units: are lights as Blender exports them?
+        light_groups: which lights may become one.
     """
 
     stage: Usd.Stage
@@ -64,6 +67,7 @@ class Context:
     subdivision: int | None = None
     legacy_lights: bool = False
     blender_light_units: bool = False
+    light_groups: LightGroups = field(default_factory=LightGroups)
 
     def value(self, attribute, fallback=None):
         """Return an attribute's value, ``fallback`` if it has none or is blocked.

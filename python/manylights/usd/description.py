@@ -22,6 +22,7 @@ class MeshShape:
         attributes: arrays by name, ``vertex_...`` with n rows or ``face_...`` with m.
         bsdf: a dictionary for Mitsuba, ``None`` for none.
         radiance: a dictionary for Mitsuba of what the front side emits, ``None`` for nothing.
+        light: what it is called if there are groups of lights, a path of a prim.
     """
 
     positions: np.ndarray
@@ -31,6 +32,7 @@ class MeshShape:
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
     bsdf: dict | None = None
     radiance: dict | None = None
+    light: str | None = None
 
     def instantiate(self, name: str, objects: dict) -> mi.Mesh:
         """Return the mesh as an object; ``objects`` keeps the parts that several meshes share."""

@@ -10,6 +10,7 @@ import numpy as np
 from manylights.usd.context import Context
 from manylights.usd.images import Image, read_image
 from manylights.usd.inputs import LightInputs
+from manylights.usd.light_groups import Member
 
 #: Rows are where the axes of a dome with its pole along Z go, as ``p @ POLE_Z``: turned by 90
 #: degrees around X.
@@ -39,10 +40,12 @@ class Domes:
         self.constant = np.zeros(3)
         self.count = 0
         self._domes: list[Dome] = []
+        self._members: list[Member] = []
 
-    def add(self, inputs: LightInputs, radiance: np.ndarray, matrices: np.ndarray) -> int:
-        """Add a dome at all its places; return how many shine."""
+    def add(self, inputs: LightInputs, radiance, matrices: np.ndarray, member=None) -> int:
+        """Add a dome at all its places, of a group of lights; return how many shine."""
         notes, prim = self.context.notes, inputs.prim
+        self._members += [member] if member and np.any(radiance) else []
         if inputs.get("texture:format") not in ("automatic", "latlong"):
             text = f"a dome's texture:format {inputs.get('texture:format')} was read as latlong"
             notes.add("texture:format", text, prim)
@@ -75,11 +78,13 @@ class Domes:
         if self.count > 1:
             text = f"{self.count} domes became one environment, their sum"
             self.context.notes.add("domes", text, "/")
+        self.context.light_groups.check_environment(self._members)
+        name = self._members[0].name if self._members else "environment"
         if not self._domes:
             if not self.constant.any():
                 return {}
             radiance = {"type": "rgb", "value": self.constant.tolist()}
-            return {"environment": {"type": "constant", "radiance": radiance}}
+            return {name: {"type": "constant", "radiance": radiance}}
         first = self._domes[0]
         mirrored = np.linalg.det(first.rotation) < 0
         if len(self._domes) == 1:
@@ -96,7 +101,7 @@ class Domes:
             "bitmap": mi.Bitmap(pixels),
             "to_world": mi.ScalarTransform4f(to_world),
         }
-        return {"environment": environment}
+        return {name: environment}
 
     def _sum(self) -> np.ndarray:
         """Return the sum of all pictures, as large as the largest."""

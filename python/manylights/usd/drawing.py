@@ -91,7 +91,7 @@ class Scenery:
             else:
                 shining.append((surface, glow))
         if shining:
-            self._shine(item.prim, surfaces, shining, worlds)
+            self._shine(batch, item, surfaces, shining)
         return quiet
 
     def _light(self, prim: Usd.Prim) -> MeshLight | None:
@@ -101,7 +101,8 @@ class Scenery:
         pointing = self._pointed.get(prim.GetPath())
         return MeshLight(pointing, self.context, tints=False) if pointing else None
 
-    def _shine(self, prim, surfaces, shining: list[tuple[Surface, Glow]], worlds) -> None:
+    def _shine(self, batch, item, surfaces, shining: list[tuple[Surface, Glow]]) -> None:
+        prim, worlds = item.prim, batch.worlds(item)
         triangles = len(worlds) * sum(len(surface.faces) for surface, _ in shining)
         if triangles > MOST_TRIANGLES:
             text = f"{triangles} shining triangles are more than {MOST_TRIANGLES}: left out"
@@ -113,9 +114,15 @@ class Scenery:
             if not (areas > 0).all():
                 text = "a light with a zero area was left out"
                 self.context.notes.add("area", text, prim, int((areas <= 0).sum()))
+        pointing = self._pointed.get(prim.GetPath())
+        others = (*([pointing.GetPath()] if pointing else []), *batch.instancers)
+        member = self.context.light_groups.of(prim, others)
         for surface, glow in shining:
-            for mesh in add_lamps(self.lights.lamps, surface, glow, worlds, areas):
-                self._enter(prim, mesh)
+            for mesh in add_lamps(self.lights.lamps, surface, glow, worlds, areas, member):
+                if mesh.light:
+                    self.entries[self.lights.named(mesh.light)] = mesh
+                else:
+                    self._enter(prim, mesh)
         self.lights.count += len(worlds)
 
     def _add_instances(self, batch: Batch, quiet) -> None:

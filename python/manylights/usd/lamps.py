@@ -9,6 +9,7 @@ import numpy as np
 
 from manylights.usd.color import lamp_spectrum, peak_of
 from manylights.usd.description import MeshShape, copied_faces, transformed, triangle_areas
+from manylights.usd.light_groups import Member
 
 #: Radiances that become a mesh each, which every integrator can sample. More become one mesh with
 #: the attribute ``face_color``, which only ours can.
@@ -23,6 +24,7 @@ class _Part:
     faces: np.ndarray
     radiance: np.ndarray
     bsdf: dict | None
+    member: Member | None
 
 
 class Lamps:
@@ -36,7 +38,7 @@ class Lamps:
         self._parts: list[_Part] = []
         self.uses_attribute = False
 
-    def add(self, points, faces, matrices, radiances, bsdf=None, areas=None) -> None:
+    def add(self, points, faces, matrices, radiances, bsdf=None, areas=None, member=None) -> None:
         """Add copies of a mesh.
 
         Args:
@@ -46,6 +48,7 @@ class Lamps:
             radiances: ``(n, 3)``.
             bsdf: a dictionary for Mitsuba.
             areas: ``(n,)`` of the shapes that the meshes stand for: the power is that of these.
+            member: of a group of lights. Default: there are none.
         """
         positions = transformed(np.asarray(points), matrices)
         radiances = np.broadcast_to(radiances, (len(matrices), 3))
@@ -62,15 +65,23 @@ class Lamps:
                 copies.reshape(-1, 3),
                 radiances.astype(np.float32),
                 bsdf,
+                member,
             )
         )
 
     def meshes(self) -> list[MeshShape]:
-        """Return as few meshes as BSDFs and variant allow, all triangles once."""
-        groups: dict[int, list[_Part]] = {}
+        """Return as few meshes as BSDFs, groups and variant allow, all triangles once."""
+        groups: dict[tuple, list[_Part]] = {}
         for part in self._parts:
-            groups.setdefault(id(part.bsdf), []).append(part)
-        return [mesh for parts in groups.values() for mesh in self._join(parts)]
+            key = id(part.bsdf), part.member and part.member.entry
+            groups.setdefault(key, []).append(part)
+        result = []
+        for parts in groups.values():
+            meshes = self._join(parts)
+            for mesh in meshes:
+                mesh.light = parts[0].member and parts[0].member.name
+            result += meshes
+        return result
 
     def _join(self, parts: list[_Part]) -> list[MeshShape]:
         """Return the meshes of one BSDF: one for each radiance, or one for all."""

@@ -19,6 +19,7 @@ from manylights.usd.domes import Domes
 from manylights.usd.images import read_image
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
+from manylights.usd.light_groups import Member, split
 from manylights.usd.light_shapes import AREAS, EXACT, SHAPES, corners, facing, scaled, unmirrored
 
 #: Round lights up to this number stay exact shapes, flat ones up to the other.
@@ -43,12 +44,14 @@ class Light:
         matrices: ``(n, 4, 4)`` to the world of its unit shape.
         radiance: three channels, if ``normalize`` times the area.
         normalize: divide the radiance by the area?
+        member: of a group of lights, ``None`` if there are none.
     """
 
     prim: Usd.Prim
     matrices: np.ndarray
     radiance: np.ndarray
     normalize: bool
+    member: Member | None = None
 
 
 class Lights:
@@ -69,11 +72,13 @@ class Lights:
         self.count = 0
         self._kinds: dict[str, list[Light]] = {}
         self._points: list[np.ndarray] = []
+        self._member: Member | None = None
+        self._named: dict[str, int] = {}
 
     # -- Reading
 
-    def add(self, prim: Usd.Prim, matrices: np.ndarray) -> None:
-        """Add a light at all its places, ``(n, 4, 4)``."""
+    def add(self, prim: Usd.Prim, matrices: np.ndarray, instancers: tuple = ()) -> None:
+        """Add a light at all its places, ``(n, 4, 4)``, where these instancers have put it."""
         reader = READERS.get(str(prim.GetTypeName()))
         notes = self.context.notes
         if reader is None:
@@ -87,6 +92,8 @@ class Lights:
                 return
             inputs.note_unsupported()
             _note_visibility(inputs)
+            shines = np.any(radiance) and reader not in (Lights._portal, Lights._geometry)
+            self._member = self.context.light_groups.of(prim, instancers, shines)
             reader(self, inputs, radiance, matrices)
         except (TypeError, ValueError, Tf.ErrorException) as error:
             text = " ".join(str(error).split())
@@ -141,7 +148,7 @@ class Lights:
         self._shine(radiance, int(good.sum()))
 
     def _dome(self, inputs: LightInputs, radiance, matrices) -> None:
-        shining = self.domes.add(inputs, radiance, matrices)
+        shining = self.domes.add(inputs, radiance, matrices, self._member)
         self._shine(radiance, shining)
 
     def _portal(self, inputs: LightInputs, radiance, matrices) -> None:
@@ -180,7 +187,7 @@ class Lights:
         normalize = bool(inputs.get("normalize"))
         cone = shaping.Cone.read(inputs, kind)
         if cone is None:
-            light = Light(inputs.prim, matrices, radiance, normalize)
+            light = Light(inputs.prim, matrices, radiance, normalize, self._member)
             self._kinds.setdefault(kind, []).append(light)
             return
         areas = AREAS[kind](matrices[:, :3, :3])
@@ -226,8 +233,15 @@ class Lights:
             self.count += count
 
     def emit(self, kind: str, **parameters) -> None:
-        """Add a finished part of the description."""
-        self.entries[f"light_{len(self.entries)}"] = {"type": kind, **parameters}
+        """Add a finished part of the description, of the light that is at hand."""
+        member = self._member
+        name = self.named(member.name) if member else f"light_{len(self.entries)}"
+        self.entries[name] = {"type": kind, **parameters}
+
+    def named(self, path: str) -> str:
+        """Return a key for something that is called by a path: the first one is the path."""
+        count = self._named[path] = self._named.get(path, 0) + 1
+        return path if count == 1 else f"{path}#{count}"
 
     # -- The end
 
@@ -239,20 +253,23 @@ class Lights:
     def finish(self, size: float) -> None:
         """Turn what was read into entries and lamps; ``size`` is that of the scene."""
         for kind, lights in self._kinds.items():
-            matrices, radiance, areas = self._joined(kind, lights)
+            matrices, radiance, areas, which = self._joined(kind, lights)
+            members = [light.member for light in lights]
             exact = EXACT[kind](matrices, size)
             most = MOST_FLAT if kind == "rect" else MOST_ROUND
             if exact.sum() > most:
                 exact[:] = False
-            for matrix, value in zip(matrices[exact], radiance[exact]):
+            for matrix, value, light in zip(matrices[exact], radiance[exact], which[exact]):
                 emitter = {"type": "area", "radiance": constant(value)}
+                self._member = members[light]
                 self.emit(**SHAPES[kind](matrix), emitter=emitter)
             if not exact.all():
-                self._bake(kind, matrices[~exact], radiance[~exact], areas[~exact])
+                parts = list(split(members, which[~exact]))
+                self._bake(kind, matrices[~exact], radiance[~exact], areas[~exact], parts)
         self.entries.update(self.domes.finish())
 
-    def _joined(self, kind: str, lights: list[Light]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return matrices, radiances and areas of all lights of a kind that shine."""
+    def _joined(self, kind: str, lights: list[Light]) -> tuple[np.ndarray, ...]:
+        """Return matrices, radiances, areas and numbers of all lights of a kind that shine."""
         counts = [len(light.matrices) for light in lights]
         matrices = np.concatenate([light.matrices for light in lights])
         radiance = np.repeat([light.radiance for light in lights], counts, axis=0)
@@ -262,13 +279,15 @@ class Lights:
         radiance[divided] /= areas[divided, None]
         good &= radiance.any(axis=1)
         self.count += int(good.sum())
-        return matrices[good], radiance[good], areas[good]
+        which = np.repeat(np.arange(len(lights)), counts)
+        return matrices[good], radiance[good], areas[good], which[good]
 
-    def _bake(self, kind: str, matrices, radiance, areas) -> None:
-        """Turn lights into triangles."""
+    def _bake(self, kind: str, matrices, radiance, areas, parts) -> None:
+        """Turn lights into triangles; ``parts`` are those of each group, see ``split``."""
         count = len(matrices)
         if kind == "rect":
-            self.lamps.add(*shapes.square(), matrices, radiance)
+            for member, part in parts:
+                self.lamps.add(*shapes.square(), matrices[part], radiance[part], member=member)
             return
         if kind == "sphere":
             level = next(level for most, level in SPHERE_LEVELS if count <= most)
@@ -279,7 +298,11 @@ class Lights:
             points, faces = (shapes.circle if kind == "disk" else shapes.tube)(segments)
         text = f"{kind} lights became meshes of {len(faces)} triangles with the same power"
         self.context.notes.add(f"tessellated {kind}", text, "/", count)
-        self.lamps.add(points, faces, matrices, radiance, areas=areas)
+        for member, part in parts:
+            own = points if points.ndim == 2 else points[part]
+            self.lamps.add(
+                own, faces, matrices[part], radiance[part], areas=areas[part], member=member
+            )
 
 
 def _note_visibility(inputs: LightInputs) -> None:

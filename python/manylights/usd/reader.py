@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from manylights.errors import one_line
 from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
+from manylights.loading.light_groups import PARAMETER, as_text
 from manylights.loading.parsing import MOST_SUBDIVISION, UsdOptions
 from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
 from manylights.usd.description import instantiate
 from manylights.usd.drawing import Scenery
+from manylights.usd.light_groups import LightGroups
 from manylights.usd.lights import Lights
 from manylights.usd.settings import RenderSettings
 from manylights.usd.stage import StageError, guarded, layer_files, open_stage, time_of
@@ -50,6 +54,7 @@ def load(
     default_light=False,
     legacy_lights=False,
     blender_light_units=False,
+    light_groups="",
 ) -> SceneDict:
     """Read a USD stage as a dictionary for ``mi.load_dict``.
 
@@ -71,6 +76,9 @@ def load(
         legacy_lights: read the inputs of lights from before USD 21.05, without ``inputs:``?
         blender_light_units: are lights as Blender (5.0) exports them: suns with a quarter of their
             irradiance and half of their angle, and all with a color temperature, 6500 for white?
+        light_groups: groups of lights, as for the integrators: ``"key=/World/Lamps/*"``. Only lamps
+            of one group become one mesh, and lights are called by the paths of their prims.
+            Default: what the integrator of the render settings says.
 
     Returns:
         A dictionary with objects of the current variant of Mitsuba, and the attribute ``notes``.
@@ -88,6 +96,7 @@ def load(
         default_light=default_light,
         legacy_lights=legacy_lights,
         blender_light_units=blender_light_units,
+        light_groups=light_groups,
     )
     result = SceneDict(instantiate(description))
     result.__dict__.update(description.__dict__)
@@ -117,6 +126,8 @@ def describe(path, **choices) -> SceneDict:
             legacy_lights=options.legacy_lights,
             blender_light_units=options.blender_light_units,
         )
+        asked = options.light_groups or _groups_of_settings(context)
+        context.light_groups = LightGroups(as_text(asked))
         skinning.bake(context)
         return _read(context, options.camera, options.default_light)
 
@@ -136,7 +147,7 @@ def _read(context: Context, camera, default_light: bool) -> SceneDict:
     for batch in batches:
         for item in batch.items:
             if item.role == "light":
-                lights.add(item.prim, batch.worlds(item))
+                lights.add(item.prim, batch.worlds(item), batch.instancers)
         drawing.add(batch)
     return _scene(context, lights, drawing, camera, default_light)
 
@@ -145,13 +156,14 @@ def _scene(context: Context, lights: Lights, drawing: Scenery, camera, default_l
     geometry = drawing.points()
     points = np.concatenate([geometry, lights.points()])
     points = points[np.isfinite(points).all(axis=1)]
+    context.light_groups.check()
     lights.finish(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0)
     settings = RenderSettings(context)
     scene = SceneDict(type="scene")
     _add_sensor(scene, context, settings, camera, geometry if len(geometry) else points)
     scene.update(lights.entries)
-    meshes = lights.lamps.meshes()
-    scene.update({f"lamps_{index}": mesh for index, mesh in enumerate(meshes)})
+    for index, mesh in enumerate(lights.lamps.meshes()):
+        scene[lights.named(mesh.light) if mesh.light else f"lamps_{index}"] = mesh
     scene.update(drawing.entries)
     scene["integrator"] = _integrator(context, settings, lights.lamps.uses_attribute)
     if not lights.count:
@@ -162,6 +174,13 @@ def _scene(context: Context, lights: Lights, drawing: Scenery, camera, default_l
     scene.metadata = _metadata(context)
     scene.files = layer_files(context.stage)
     return scene
+
+
+def _groups_of_settings(context: Context) -> str:
+    """Return the groups of lights that the integrator of a stage has."""
+    quiet = replace(context, notes=Notes())
+    asked = RenderSettings(quiet).integrator() or {}
+    return str(asked.get(PARAMETER, ""))
 
 
 def _add_sensor(

@@ -13,6 +13,7 @@ from manylights.usd.copies import copies
 from manylights.usd.description import MeshShape, transformed, triangle_areas
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
+from manylights.usd.light_groups import Member
 from manylights.usd.shaping import Cone
 from manylights.usd.surface import Surface
 from manylights.usd.textures import scaled
@@ -152,7 +153,9 @@ def two_sided(surface: Surface) -> Surface:
     )
 
 
-def add_lamps(lamps: Lamps, surface: Surface, glow: Glow, worlds, areas) -> list[MeshShape]:
+def add_lamps(
+    lamps: Lamps, surface: Surface, glow: Glow, worlds, areas, member: Member | None = None
+) -> list[MeshShape]:
     """Add a surface in all its places; return the meshes that lamps cannot hold.
 
     Args:
@@ -161,6 +164,7 @@ def add_lamps(lamps: Lamps, surface: Surface, glow: Glow, worlds, areas) -> list
         glow: how.
         worlds: ``(n, 4, 4)``.
         areas: ``(n,)`` of the whole prim, to normalize by.
+        member: of a group of lights. Default: there are none.
     """
     radiance = np.broadcast_to(glow.radiance, (len(worlds), 3))
     if glow.normalize:
@@ -173,9 +177,19 @@ def add_lamps(lamps: Lamps, surface: Surface, glow: Glow, worlds, areas) -> list
         radiance = radiance * _mean(glow.texture)
         glow = replace(glow, texture=None)
     if glow.needs_mesh:
-        return _own_meshes(surface, glow, worlds, radiance)
+        meshes = _own_meshes(surface, glow, worlds, radiance)
+        for mesh in meshes:
+            mesh.light = member and member.name
+        return meshes
     for chunk in chunks(len(worlds), len(surface.faces)):
-        lamps.add(surface.positions, surface.faces, worlds[chunk], radiance[chunk], glow.bsdf)
+        lamps.add(
+            surface.positions,
+            surface.faces,
+            worlds[chunk],
+            radiance[chunk],
+            glow.bsdf,
+            member=member,
+        )
     return []
 
 

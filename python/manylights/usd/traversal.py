@@ -50,10 +50,12 @@ class Batch:
     Attributes:
         transforms: ``(n, 4, 4)`` to the world.
         items: in the order of the stage.
+        instancers: paths of the point instancers that they are in.
     """
 
     transforms: np.ndarray
     items: list[Item] = field(default_factory=list)
+    instancers: tuple[Sdf.Path, ...] = ()
 
     def worlds(self, item: Item) -> np.ndarray:
         """Return the transforms of an item to the world, ``(n, 4, 4)``."""
@@ -107,6 +109,7 @@ class _Traversal:
         self._native: dict[tuple, list[tuple[Usd.Prim, _State]]] = {}
         self._inherited: dict[Sdf.Path, tuple] = {}
         self._roles: dict[tuple, str] = {}
+        self._below: dict[Sdf.Path, list[str]] = {}
 
     def run(self) -> list[Batch]:
         """Return the batches, see :func:`collect`."""
@@ -151,6 +154,7 @@ class _Traversal:
         state = self._enter(prim, imageable, state, is_root)
         if prim.IsInstance() and not is_root:
             key = (prim.GetPrototype().GetPath(), state.purpose, self._inheritance(prim))
+            key = (*key, self._light_groups(prim))
             self._native.setdefault(key, []).append((prim, state))
             return None
         if (state.purpose or UsdGeom.Tokens.default_) in self.context.purposes:
@@ -191,6 +195,22 @@ class _Traversal:
             counts = any(name.startswith(("material:binding", "primvars:")) for name in names)
             self._inherited[path] = (*above, path) if counts else above
         return self._inherited[path]
+
+    def _light_groups(self, prim: Usd.Prim) -> tuple:
+        """Return which entries of the light groups what is below an instance belongs to."""
+        groups = self.context.light_groups
+        if not groups:
+            return ()
+        prototype = prim.GetPrototype()
+        if prototype.GetPath() not in self._below:
+            root = str(prototype.GetPath())
+            parts = Usd.PrimRange(prototype, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
+            roles = ("light", "geometry", "instancer")
+            self._below[prototype.GetPath()] = [
+                str(part.GetPath())[len(root) :] for part in parts if self._role(part) in roles
+            ]
+        path = str(prim.GetPath())
+        return tuple(groups.entry_of(path + part) for part in self._below[prototype.GetPath()])
 
     def _flush_native(self, batch: Batch) -> None:
         """Make one batch of all native instances of a prototype that look the same."""
@@ -286,7 +306,8 @@ class _Traversal:
             self.context.notes.add("instances", text, root, count)
             return
         transforms = (matrices[:, None] @ batch.transforms[None]).reshape(-1, 4, 4)
-        self._waiting.append((root, state, Batch(transforms), predicate))
+        batch = Batch(transforms, instancers=state.chain)
+        self._waiting.append((root, state, batch, predicate))
 
 
 def _role_of(prim: Usd.Prim) -> str:
