@@ -213,8 +213,6 @@ def lamp(kind):
     }[kind]()
 
 
-
-
 @VARIANTS
 @pytest.mark.parametrize("integrator", [DIRECT, PATHS], ids=["direct", "volpath"])
 @pytest.mark.parametrize("kind", ["point", "spot", "rectangle", "disk", "cube", "textured"])

@@ -99,7 +99,7 @@ def test_unbiased(variant, case):
     scene = mi.load_dict(SCENES[name]())
     reference = integrator(kind, **REFERENCES[kind])
     seeds = range(12)
-    expected = images(scene, reference, range(100, 108), REFERENCE_SAMPLES[kind])
+    expected = images(scene, reference, range(100, 112), REFERENCE_SAMPLES[kind])
     learnt = images(scene, integrator(kind), seeds)
     tools.assert_same_mean(learnt, expected, label=f"{case}, learning")
     kept = integrator(kind, learn_visibility="keep")
