@@ -192,23 +192,24 @@ class SceneRun:
             equal_time=self.settings.budget,
         )
 
-    def _draw(self, candidate: Candidate, spp: int, seed: int, draw=draw) -> Drawing:
-        method = candidate.method
+    def _draw(self, candidate: Candidate, spp: int, seed: int, denoised=False) -> Drawing:
+        method, render = candidate.method, draw_denoised if denoised else draw
         try:
             if method.name == "power":
-                return self._draw_by_power(candidate, spp, seed, draw)
+                return self._draw_by_power(candidate, spp, seed, render)
             if method.spec in self.stale:
-                draw(self.loaded, candidate.integrator, 1, CALIBRATION_SEED, candidate.sampler)
+                render(self.loaded, candidate.integrator, 1, CALIBRATION_SEED, candidate.sampler)
                 self.stale.discard(method.spec)
-            return draw(self.loaded, candidate.integrator, spp, seed, candidate.sampler_of(spp))
+            return render(self.loaded, candidate.integrator, spp, seed, candidate.sampler_of(spp))
         except RuntimeError as error:
             where = f"{self.entry['name']}, {method.spec}"
             raise UsageError(f"{where}: {one_line(error)}") from error
 
-    def _draw_by_power(self, candidate: Candidate, spp: int, seed: int, draw) -> Drawing:
+    def _draw_by_power(self, candidate: Candidate, spp: int, seed: int, render) -> Drawing:
         scene = self.loaded.scene
         with power_sampling(scene, self.weights):
-            drawing = draw(self.loaded, candidate.integrator, spp, seed, candidate.sampler_of(spp))
+            sampler = candidate.sampler_of(spp)
+            drawing = render(self.loaded, candidate.integrator, spp, seed, sampler)
         # Mitsuba tells environments about each change, which makes them look new to our trees.
         if scene.environment() is not None:
             self.stale = {method.spec for method in self.task.methods if method.is_ours}
@@ -340,14 +341,8 @@ class SceneRun:
     def _measure_all(self, candidates: list[Candidate]) -> None:
         for seed in range(1, self.settings.seeds + 1):
             for candidate in list(candidates):
-                steps = [
-                    self._measure,
-                    *([self._measure_denoised] if self.settings.denoise else []),
-                ]
-                for step in steps:
-                    if not self._attempt(candidate, lambda c, s=seed, step=step: step(c, s)):
-                        candidates.remove(candidate)
-                        break
+                if not self._attempt(candidate, lambda c, seed=seed: _measure(self, c, seed)):
+                    candidates.remove(candidate)
                 self.work.finish(self.task.source.text, self._group_seconds(candidate))
 
     def _measure(self, candidate: Candidate, seed: int) -> None:
@@ -363,25 +358,6 @@ class SceneRun:
             self._add_moments(candidate, seed, drawings[-1].image)
         if series_of(self.entry, candidate.method) is None:
             self.entry["series"].append(series)
-        self.found.save()
-
-    def _measure_denoised(self, candidate: Candidate, seed: int) -> None:
-        """Do the same with denoised images, the renders of which have albedo and normals, too."""
-        points = candidate.series.setdefault("denoised", [])
-        known = {point["spp"] for point in points}
-        points += [records.new_point(spp) for spp in candidate.spps if spp not in known]
-        points.sort(key=lambda point: point["spp"])
-        missing = [point for point in points if seed not in point["seed"]]
-        if not missing:
-            return
-        description = with_guides(integrator_for(candidate.method, self.loaded.kind))
-        guided = replace(candidate, integrator=mi.load_dict(description))
-        for point in missing:
-            key = candidate.method.spec, point["spp"]
-            if key not in self.warm:
-                self._draw(guided, point["spp"], CALIBRATION_SEED, draw_denoised)
-                self.warm.add(key)
-            self._note(point, seed, self._draw(guided, point["spp"], seed, draw_denoised))
         self.found.save()
 
     def _note(self, point: dict[str, Any], seed: int, drawing: Drawing) -> None:
@@ -492,6 +468,33 @@ def _choose_sampler(
         spp: draw(candidate, spp, CALIBRATION_SEED).seconds for spp in candidate.times
     }
     return chosen
+
+
+def _measure(run: SceneRun, candidate: Candidate, seed: int) -> None:
+    """Measure the images of a seed, and denoised ones if that is wanted."""
+    run._measure(candidate, seed)
+    if run.settings.denoise:
+        _measure_denoised(run, candidate, seed)
+
+
+def _measure_denoised(run: SceneRun, candidate: Candidate, seed: int) -> None:
+    """Do the same with denoised images, the renders of which have albedo and normals, too."""
+    points = candidate.series.setdefault("denoised", [])
+    known = {point["spp"] for point in points}
+    points += [records.new_point(spp) for spp in candidate.spps if spp not in known]
+    points.sort(key=lambda point: point["spp"])
+    missing = [point for point in points if seed not in point["seed"]]
+    if not missing:
+        return
+    description = with_guides(integrator_for(candidate.method, run.loaded.kind))
+    guided = replace(candidate, integrator=mi.load_dict(description))
+    for point in missing:
+        key = candidate.method.spec, point["spp"]
+        if key not in run.warm:
+            run._draw(guided, point["spp"], CALIBRATION_SEED, denoised=True)
+            run.warm.add(key)
+        run._note(point, seed, run._draw(guided, point["spp"], seed, denoised=True))
+    run.found.save()
 
 
 def _build_seconds(candidate: Candidate) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from manylights.usd.context import Context
 from manylights.usd.images import Image, read_image
 from manylights.usd.inputs import LightInputs
-from manylights.usd.light_groups import Member
+from manylights.usd.light_groups import GroupMember
 
 #: Rows are where the axes of a dome with its pole along Z go, as ``p @ POLE_Z``: turned by 90
 #: degrees around X.
@@ -40,7 +40,7 @@ class Domes:
         self.constant = np.zeros(3)
         self.count = 0
         self._domes: list[Dome] = []
-        self._members: list[Member] = []
+        self._members: list[GroupMember] = []
 
     def add(self, inputs: LightInputs, radiance, matrices: np.ndarray, member=None) -> int:
         """Add a dome at all its places, of a group of lights; return how many shine."""

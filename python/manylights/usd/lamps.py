@@ -9,7 +9,7 @@ import numpy as np
 
 from manylights.usd.color import lamp_spectrum, peak_of
 from manylights.usd.description import MeshShape, copied_faces, transformed, triangle_areas
-from manylights.usd.light_groups import Member
+from manylights.usd.light_groups import GroupMember
 
 #: Radiances that become a mesh each, which every integrator can sample. More become one mesh with
 #: the attribute ``face_color``, which only ours can.
@@ -24,7 +24,7 @@ class _Part:
     faces: np.ndarray
     radiance: np.ndarray
     bsdf: dict | None
-    member: Member | None
+    member: GroupMember | None
 
 
 class Lamps:

@@ -20,7 +20,7 @@ MOST_PATHS = 8
 
 
 @dataclass(frozen=True)
-class Member:
+class GroupMember:
     """A light in a group.
 
     Attributes:
@@ -53,7 +53,7 @@ class LightGroups:
 
     def of(
         self, prim: Usd.Prim, others: Iterable[Sdf.Path] = (), shines: bool = True
-    ) -> Member | None:
+    ) -> GroupMember | None:
         """Return where a light belongs, ``None`` if there are no groups.
 
         Args:
@@ -69,7 +69,7 @@ class LightGroups:
         if shines:
             self._used.add(entry)
             self._paths.setdefault(paths[0])
-        return Member(entry, name)
+        return GroupMember(entry, name)
 
     def check(self) -> None:
         """Raise ``UsageError`` for an entry that no light is in; the plugins check the grammar."""
@@ -84,7 +84,7 @@ class LightGroups:
                     f"The stage has {self._listed()}"
                 )
 
-    def check_environment(self, members: Iterable[Member | None]) -> None:
+    def check_environment(self, members: Iterable[GroupMember | None]) -> None:
         """Raise ``UsageError`` if the domes that become one environment are in several entries."""
         entries, found = self.text.split(","), {}
         for member in filter(None, members):
@@ -104,7 +104,7 @@ class LightGroups:
         return f"{lights}: {', '.join(paths[:MOST_PATHS])}{more}" if paths else "no light"
 
 
-def split(members: list[Member | None], which: np.ndarray) -> Iterator[tuple]:
+def split(members: list[GroupMember | None], which: np.ndarray) -> Iterator[tuple]:
     """Yield one member of each entry, and which elements are of that entry.
 
     Args:

@@ -19,7 +19,7 @@ from manylights.usd.domes import Domes
 from manylights.usd.images import read_image
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
-from manylights.usd.light_groups import Member, split
+from manylights.usd.light_groups import GroupMember, split
 from manylights.usd.light_shapes import AREAS, EXACT, SHAPES, corners, facing, scaled, unmirrored
 
 #: Round lights up to this number stay exact shapes, flat ones up to the other.
@@ -51,7 +51,7 @@ class Light:
     matrices: np.ndarray
     radiance: np.ndarray
     normalize: bool
-    member: Member | None = None
+    member: GroupMember | None = None
 
 
 class Lights:
@@ -72,7 +72,7 @@ class Lights:
         self.count = 0
         self._kinds: dict[str, list[Light]] = {}
         self._points: list[np.ndarray] = []
-        self._member: Member | None = None
+        self._member: GroupMember | None = None
         self._named: dict[str, int] = {}
 
     # -- Reading

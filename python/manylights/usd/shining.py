@@ -13,7 +13,7 @@ from manylights.usd.copies import copies
 from manylights.usd.description import MeshShape, transformed, triangle_areas
 from manylights.usd.inputs import LightInputs
 from manylights.usd.lamps import Lamps, constant
-from manylights.usd.light_groups import Member
+from manylights.usd.light_groups import GroupMember
 from manylights.usd.shaping import Cone
 from manylights.usd.surface import Surface
 from manylights.usd.textures import scaled
@@ -154,7 +154,7 @@ def two_sided(surface: Surface) -> Surface:
 
 
 def add_lamps(
-    lamps: Lamps, surface: Surface, glow: Glow, worlds, areas, member: Member | None = None
+    lamps: Lamps, surface: Surface, glow: Glow, worlds, areas, member: GroupMember | None = None
 ) -> list[MeshShape]:
     """Add a surface in all its places; return the meshes that lamps cannot hold.
 
