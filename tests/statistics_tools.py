@@ -13,11 +13,18 @@ comparison of two unbiased estimators fails.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import stats
+
+from manylights.threads import thread_count
+
+PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+"""How many processes of tests there are."""
 
 SIGNIFICANCE = 1e-5
 """Default probability of a false alarm of one comparison; a whole run has a few hundred."""
@@ -45,9 +52,11 @@ What is darker is the tail of some lobe, of which a reference may find nothing w
 def render_seeds(scene, integrator=None, spp=16, seeds=range(16), sensor=0):
     """Render `scene` once per seed; returns an array of shape (seeds, height, width, channels)."""
     images = []
-    for seed in seeds:
-        image = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=int(seed))
-        images.append(np.array(image, dtype=np.float64))
+    # Where processes share the cores, further threads only wait for each other
+    with thread_count(None if PROCESSES == 1 else max(1, dr.thread_count() // PROCESSES)):
+        for seed in seeds:
+            image = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=int(seed))
+            images.append(np.array(image, dtype=np.float64))
     images = np.stack(images)
     return images if images.ndim == 4 else images[..., np.newaxis]
 
