@@ -19,9 +19,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import stats
-
 from manylights.threads import thread_count
+from scipy import stats
 
 PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 """How many processes of tests there are."""
