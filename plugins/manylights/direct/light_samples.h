@@ -184,18 +184,13 @@ private:
 
         Interaction3f from = vertex.origin();
         Vector3f d         = dr::normalize(Point3f(point.p) - from.p);
-        Spectrum emission  = mitsuba::depolarizer<Spectrum>(
-            m_emission.color(row, from.wavelengths) & Mask(row.tabulated()));
-        if (m_lights.needs_emitter_eval()) {
-            Mask eval = active && !row.tabulated();
-            if (target_only)
-                dr::masked(emission, eval) = mitsuba::depolarizer<Spectrum>(
+        Spectrum emission  = target_only
+                                 ? m_emission.tabulated(row, from.wavelengths)
+                                 : m_emission.of_point(from, row, point, d, active);
+        if (target_only && m_lights.needs_emitter_eval())
+            dr::masked(emission, active && !row.tabulated()) =
+                mitsuba::depolarizer<Spectrum>(
                     UnpolarizedSpectrum(Float(row[kBrightness])));
-            else
-                m_emission.add_masked(emission, eval, [&](Mask m) {
-                    return m_emission.emission_by_emitter(from, row, point, d, m);
-                });
-        }
         bool delta_only = !m_lights.can_be_hit();
         Float light_pdf = delta_only ? Float(0.f) : Float(inclusion * point.pdf);
         Mask delta      = is_delta(row, m_lights.table_kinds());

@@ -5,9 +5,8 @@
  * and a generator for all that needs no stratification.
  */
 
+#include "manylights/base/random.h"
 #include "vertex.h"
-#include <drjit/random.h>
-#include <mitsuba/core/random.h>
 #include <utility>
 
 namespace manylights {
@@ -33,10 +32,8 @@ template <typename FloatD> auto seed_bits(const LightSample<FloatD> &u) {
 /// Numbers that need no stratification, seeded with the bits of those that have it
 template <typename FloatD>
 VertexRng<FloatD> make_rng(const LightSample<FloatD> &u, uint64_t stream = 1) {
-    auto bits     = seed_bits(u);
-    auto [a, b]   = mitsuba::sample_tea_32(bits.first, bits.second);
-    using UInt64D = dr::uint64_array_t<dr::uint32_array_t<FloatD>>;
-    return VertexRng<FloatD>(1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(stream));
+    auto bits = seed_bits(u);
+    return seeded_rng(bits.first, bits.second, stream);
 }
 
 /// x + number / 2^32, modulo 1: exact however many slots there are

@@ -171,14 +171,13 @@ public:
             m_cells   = repeat(m_cells, 1);
             dr::make_opaque(m_factors, m_counts, m_cells);
         } else {
-            auto repeat = [&](auto &result, const auto &array, uint32_t width) {
+            auto repeat = [&](auto &&result, const auto &array, uint32_t width) {
                 for (size_t i = 0; i < (size_t) records * width; ++i)
                     result[i] = (uint32_t) array[i & (m_records * width - 1)];
             };
             Storage factors = dr::empty<Storage>(records);
             Counts counts(records * kCounts), cells(records);
-            for (size_t i = 0; i < records; ++i)
-                factors.data()[i] = m_factors.data()[i & (m_records - 1)];
+            repeat(factors.data(), m_factors.data(), 1);
             repeat(counts, m_counts, kCounts);
             repeat(cells, m_cells, 1);
             m_factors = std::move(factors);

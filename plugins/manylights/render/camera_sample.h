@@ -2,6 +2,7 @@
 
 /// What a ray from the camera puts into the channels of a film.
 
+#include "film_channels.h"
 #include "film_color.h"
 #include <mitsuba/render/film.h>
 #include <mitsuba/render/sampler.h>
@@ -43,10 +44,9 @@ public:
         if (ray.has_differentials)
             ray.scale_differential(scale);
 
-        bool has_alpha         = has_flag(m_film->flags(), mitsuba::FilmFlags::Alpha);
         auto [spectrum, valid] = m_integrator.sample_weighted(
             m_scene, m_sampler, ray, &weight, m_sensor->medium(),
-            values + (has_alpha ? 5 : 4), active);
+            values + own_channels(m_film), active);
         write(values, mitsuba::unpolarized_spectrum(weight * spectrum), ray.wavelengths,
               valid, active);
         return offset;
@@ -65,10 +65,10 @@ private:
         Color3f rgb = film_color<Float, Spectrum>(spectrum, wavelengths, active);
         for (size_t i = 0; i < 3; ++i)
             values[i] = rgb.entry(i);
-        bool has_alpha = has_flag(m_film->flags(), mitsuba::FilmFlags::Alpha);
-        if (has_alpha)
+        size_t weight = own_channels(m_film) - 1;
+        if (weight > 3)
             values[3] = alpha;
-        values[has_alpha ? 4 : 3] = 1.f;
+        values[weight] = 1.f;
     }
 
     const Integrator &m_integrator;

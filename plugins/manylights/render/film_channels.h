@@ -7,8 +7,14 @@
 
 #include "aov_list.h"
 #include "manylights/choice/parameters.h"
+#include <mitsuba/render/film.h>
 
 namespace manylights {
+
+/// How many channels of its own a film has before those: colours, alpha if wanted, the weight
+template <typename Film> size_t own_channels(const Film *film) {
+    return has_flag(film->flags(), mitsuba::FilmFlags::Alpha) ? 5 : 4;
+}
 
 struct FilmChannels {
     std::vector<std::string> names;

@@ -29,8 +29,7 @@ public:
     FixedPointSums(Film *film, double most, const FilmChannels &channels, uint32_t groups)
         : m_film(film), m_size(film->crop_size()), m_filter(film->rfilter()),
           m_box(m_filter->is_box_filter()), m_reach(m_box ? 0 : m_filter->border_size()) {
-        bool alpha    = has_flag(film->flags(), mitsuba::FilmFlags::Alpha);
-        size_t others = alpha ? 5 : 4; // there is a weight, too
+        size_t others = own_channels(film);
         add_channels(0);
         for (size_t emission : channels.emissions)
             add_channels(others + emission);

@@ -2,6 +2,7 @@
 
 /// How bright the groups of lights are in what was rendered so far.
 
+#include "film_channels.h"
 #include "manylights/base/host_view.h"
 #include "manylights/scene/light_groups.h"
 #include <mitsuba/render/film.h>
@@ -23,9 +24,7 @@ std::vector<uint32_t> group_levels(mitsuba::Film<Float, Spectrum> *film,
         return levels;
     auto raw = film->develop(/* raw = */ true);
     HostView pixels(raw.array());
-    size_t channels = raw.shape(2),
-           first =
-               (has_flag(film->flags(), mitsuba::FilmFlags::Alpha) ? 5 : 4) + first_layer;
+    size_t channels = raw.shape(2), first = own_channels(film) + first_layer;
     std::vector<double> sums(groups, 0.);
     for (size_t pixel = 0; pixel < pixels.size(); pixel += channels)
         for (size_t i = 0; i < 3 * (size_t) groups; ++i) {

@@ -6,8 +6,10 @@
  * alone: passes may have any of them.
  */
 
+#include "film_color.h"
 #include "fixed_point_sums.h"
 #include "manylights/base/divide.h"
+#include "manylights/base/random.h"
 #include "manylights/sampler/sobol.h"
 #include "manylights/scene/lamps_in_view.h"
 #include "manylights/scene/media.h"
@@ -91,11 +93,7 @@ private:
             return { fraction(a ^ c), fraction(b ^ mix_bits<UInt32D>(c ^ 0x5bd1e995u)) };
         }
 
-        typename Media::Rng rng() const {
-            using UInt64D = dr::uint64_array_t<UInt32D>;
-            auto [a, b]   = mitsuba::sample_tea_32(m_sample, m_point);
-            return { 1, UInt64D(a) + dr::sl<32>(UInt64D(b)), UInt64D(3) };
-        }
+        typename Media::Rng rng() const { return seeded_rng(m_sample, m_point, 3); }
 
     private:
         SobolSample<UInt32D> numbers(uint32_t dimension) const {
@@ -156,7 +154,8 @@ private:
              const Spectrum &emission, const Numbers &u, MaskD active) const {
         FloatD most = seen.row[kBrightness] * Sums::kHeadroom;
         auto color  = [&](const Spectrum &value) {
-            Color3f result = to_color(value, seen.ray.wavelengths, Mask(active));
+            Color3f result = film_color<Float, Spectrum>(
+                mitsuba::unpolarized_spectrum(value), seen.ray.wavelengths, Mask(active));
             active &= plain(dr::all(dr::isfinite(result)));
             return dr::clip(result, -Float(most), Float(most));
         };
@@ -221,27 +220,8 @@ private:
     /// The emission of a point towards the camera
     Spectrum emitted(const Seen &seen, Mask active) const {
         Interaction3f from(0.f, seen.ray.time, seen.ray.wavelengths, seen.ray.o);
-        Spectrum emission = mitsuba::depolarizer<Spectrum>(
-            m_emission.color(seen.row, seen.ray.wavelengths) &
-            Mask(seen.row.tabulated()));
-        if (m_lights.needs_emitter_eval())
-            m_emission.add_masked(emission, active && !Mask(seen.row.tabulated()),
-                                  [&](Mask mask) {
-                                      return m_emission.emission_by_emitter(
-                                          from, seen.row, seen.point, seen.ray.d, mask);
-                                  });
-        return emission & active;
-    }
-
-    static Color3f to_color(const Spectrum &value, const Wavelength &wavelengths,
-                            const Mask &active) {
-        UnpolarizedSpectrum spectrum = mitsuba::unpolarized_spectrum(value);
-        if constexpr (mitsuba::is_spectral_v<Spectrum>)
-            return mitsuba::spectrum_to_srgb(spectrum, wavelengths, active);
-        else if constexpr (mitsuba::is_monochromatic_v<Spectrum>)
-            return spectrum.x();
-        else
-            return spectrum;
+        return m_emission.of_point(from, seen.row, seen.point, seen.ray.d, active) &
+               active;
     }
 
     const Scene *m_scene;

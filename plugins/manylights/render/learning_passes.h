@@ -137,14 +137,15 @@ private:
             refuse_counts(size);
         }
         using LearnerCounts = typename Lights::Learner::Counts;
+        auto set            = [&](const LearnerCounts &counts) {
+            m_lights->change_learner(
+                [&](auto &learner) { learner.set_counts(m_lights->tree(), counts); });
+        };
+        if (size == rays)
+            return set(LearnerCounts(dr::detach<false>(m_counts)));
         HostView numbers(m_counts);
-        const uint32_t *begin = numbers.data();
-        m_lights->set_group_levels({ begin + rays, begin + size });
-        m_lights->change_learner([&](auto &learner) {
-            learner.set_counts(m_lights->tree(),
-                               size == rays ? LearnerCounts(dr::detach<false>(m_counts))
-                                            : dr::load<LearnerCounts>(begin, rays));
-        });
+        m_lights->set_group_levels({ numbers.data() + rays, numbers.data() + size });
+        set(dr::load<LearnerCounts>(numbers.data(), rays));
     }
 
     /// What users get to see: counts of rays, and how bright groups of lights are

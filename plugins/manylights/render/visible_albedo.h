@@ -8,10 +8,10 @@
  * Where rays go on is chosen at random, with numbers that come from the bits of the camera ray.
  */
 
+#include "film_color.h"
 #include "manylights/base/loop.h"
+#include "manylights/base/random.h"
 #include "manylights/scene/scene_shapes.h"
-#include <mitsuba/core/random.h>
-#include <mitsuba/core/spectrum.h>
 #include <mitsuba/render/bsdf.h>
 #include <mitsuba/render/interaction.h>
 
@@ -50,16 +50,12 @@ public:
     /// In the colours of the film, as Mitsuba's `aov` does it
     static Color3f to_color(const UnpolarizedSpectrum &spectrum, const Ray3f &ray,
                             Mask active) {
-        if constexpr (mitsuba::is_monochromatic_v<Spectrum>) {
-            return Color3f(spectrum.x());
-        } else if constexpr (mitsuba::is_rgb_v<Spectrum>) {
-            return spectrum;
-        } else {
+        UnpolarizedSpectrum value = spectrum;
+        if constexpr (mitsuba::is_spectral_v<Spectrum>) {
             auto pdf = mitsuba::pdf_rgb_spectrum(ray.wavelengths);
-            return mitsuba::spectrum_to_srgb(
-                spectrum * dr::select(pdf != 0.f, dr::rcp(pdf), 0.f), ray.wavelengths,
-                active);
+            value *= dr::select(pdf != 0.f, dr::rcp(pdf), 0.f);
         }
+        return film_color<Float, Spectrum>(value, ray.wavelengths, active);
     }
 
 private:
@@ -182,12 +178,9 @@ private:
         auto bits = [](const Float &x) {
             return dr::reinterpret_array<UInt32>(dr::float32_array_t<Float>(x));
         };
-        auto [a, b] =
-            mitsuba::sample_tea_32(bits(ray.d.x()) ^ (bits(ray.o.x()) * 0x9e3779b9u) ^
-                                       (bits(ray.o.z()) * 0x85ebca6bu),
-                                   bits(ray.d.y()) ^ (bits(ray.o.y()) * 0xc2b2ae35u));
-        using UInt64 = dr::uint64_array_t<UInt32>;
-        return dr::PCG32<UInt32>(1, UInt64(a) + dr::sl<32>(UInt64(b)), UInt64(1));
+        return seeded_rng<UInt32>(bits(ray.d.x()) ^ (bits(ray.o.x()) * 0x9e3779b9u) ^
+                                      (bits(ray.o.z()) * 0x85ebca6bu),
+                                  bits(ray.d.y()) ^ (bits(ray.o.y()) * 0xc2b2ae35u), 1);
     }
 
     const Scene *m_scene;

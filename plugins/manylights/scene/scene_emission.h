@@ -145,6 +145,24 @@ public:
         return emitter->eval(si, active);
     }
 
+    /// Radiance or intensity at a point of a light (any kind but `Other`), seen along d
+    Spectrum of_point(const Interaction3f &from, const Row<FloatD> &row,
+                      const LightPoint<FloatD> &point, const Vector3f &d,
+                      Mask active) const {
+        Spectrum result = tabulated(row, from.wavelengths);
+        if (m_lights.needs_emitter_eval())
+            add_masked(result, active && !row.tabulated(), [&](Mask m) {
+                return emission_by_emitter(from, row, point, d, m);
+            });
+        return result;
+    }
+
+    /// The same without asking emitters: 0 where that would be necessary
+    static Spectrum tabulated(const Row<FloatD> &row, const Wavelength &wavelengths) {
+        return mitsuba::depolarizer<Spectrum>(color(row, wavelengths) &
+                                              Mask(row.tabulated()));
+    }
+
     /// Add f(mask) where the mask is set; scalar variants do not call f otherwise
     template <typename F>
     static void add_masked(Spectrum &result, Mask mask, const F &f) {
