@@ -11,11 +11,11 @@ import mitsuba as mi
 import pytest
 from manylights.loading import has_backend
 
-# Processes of tests share the cores; tests of threads choose their number themselves. Mitsuba does
-# not read images with a single thread.
-PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-if PROCESSES > 1:
-    dr.set_thread_count(max(2, dr.thread_count() // PROCESSES))
+from tests import statistics_tools
+
+# Processes of tests share the cores. Mitsuba does not read images with a single thread.
+if statistics_tools.THREADS is not None:
+    dr.set_thread_count(max(2, statistics_tools.THREADS))
 
 VARIANTS = ("scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono_polarized")
 """Variants that the tests run in by default."""
@@ -81,8 +81,9 @@ def plugin():
 
 
 @pytest.fixture
-def thread_count():
+def thread_count(monkeypatch):
     """A function that sets the number of rendering threads; undone after the test."""
+    monkeypatch.setattr(statistics_tools, "THREADS", None)
     before = dr.thread_count()
     yield dr.set_thread_count
     dr.set_thread_count(before)

@@ -23,7 +23,9 @@ from manylights.threads import thread_count
 from scipy import stats
 
 PROCESSES = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-"""How many processes of tests there are."""
+THREADS = max(1, dr.thread_count() // PROCESSES) if PROCESSES > 1 else None
+"""A process's share of the cores, `None` if it is alone. Renders of means take it, unless a test
+chooses a number (the fixture `thread_count`): processes that share cores wait for each other."""
 
 SIGNIFICANCE = 1e-5
 """Default probability of a false alarm of one comparison; a whole run has a few hundred."""
@@ -51,8 +53,7 @@ What is darker is the tail of some lobe, of which a reference may find nothing w
 def render_seeds(scene, integrator=None, spp=16, seeds=range(16), sensor=0):
     """Render `scene` once per seed; returns an array of shape (seeds, height, width, channels)."""
     images = []
-    # Where processes share the cores, further threads only wait for each other
-    with thread_count(None if PROCESSES == 1 else max(1, dr.thread_count() // PROCESSES)):
+    with thread_count(THREADS):
         for seed in seeds:
             image = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=int(seed))
             images.append(np.array(image, dtype=np.float64))
