@@ -49,9 +49,7 @@ def draw(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str) -
     pixels = _render(loaded, integrator, spp, seed, sampler)
     seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
     image = _colors(pixels)
-    broken = int(np.sum(~np.isfinite(image).all(axis=2)))
-    if broken:
-        raise BrokenImage(f"{broken} pixels are not finite at {spp} spp with seed {seed}")
+    _check(image, spp, seed)
     return Drawing(image, seconds, cpu_seconds)
 
 
@@ -72,8 +70,7 @@ def draw_denoised(loaded: MeasuredScene, integrator, spp: int, seed: int, sample
     nested = f"{denoise.EMISSION}.A" in integrator.aov_names()
     count = (pixels.shape[2] - guides) // 2 if nested else pixels.shape[2] - guides - 3
     colors, emission = _colors(pixels[..., :count]), _colors(pixels[..., count:-guides])
-    if not np.isfinite(colors).all():
-        raise BrokenImage(f"pixels are not finite at {spp} spp with seed {seed}")
+    _check(colors, spp, seed)
     names = [f"{denoise.EMISSION}.{letter}" for letter in channels.RGB]
     names = [*channels.RGB, *names, *integrator.aov_names()[-guides:]]
     guided = np.concatenate([colors, emission, pixels[..., -guides:]], axis=2)
@@ -105,6 +102,12 @@ def _render(loaded: MeasuredScene, integrator, spp: int, seed: int, sampler: str
         pixels = integrator.render(loaded.scene, sensor, number, step.spp)
         total = total + np.array(pixels) * (step.spp / spp)
     return total
+
+
+def _check(image: np.ndarray, spp: int, seed: int) -> None:
+    broken = int(np.sum(~np.isfinite(image).all(axis=2)))
+    if broken:
+        raise BrokenImage(f"{broken} pixels are not finite at {spp} spp with seed {seed}")
 
 
 def _colors(pixels: np.ndarray) -> np.ndarray:

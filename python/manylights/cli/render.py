@@ -15,6 +15,7 @@ from manylights.output import channels, denoise, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
 from manylights.rendering import Progress, RenderResult, live, render
 from manylights.rendering.checkpoint import path_for
+from manylights.rendering.extras import Extras
 from manylights.rendering.parts import Part
 from manylights.rendering.render import part_path
 
@@ -231,15 +232,9 @@ def _run(options) -> None:
     settings = {name: integrators.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
         settings["hide_emitters"] = True
-    if options.light_groups is not None:
-        settings["light_groups"] = options.light_groups
     if options.denoise:
         denoise.check_installed()
-    aovs = denoise.with_guides(options.aov) if options.denoise else options.aov
-    if aovs is not None:
-        settings["aovs"] = channels.aov_list(aovs, "--aov")
-        if options.aov is None:
-            settings["aovs"] = integrators.Wish(settings["aovs"])
+    settings |= Extras(options.aov, options.light_groups, options.denoise).parameters("--aov")
     shared.start(options)
     if options.workers is None:
         if options.ship:

@@ -124,7 +124,8 @@ def exposed(bitmap, factor: float):
     layers = light_groups.all_channels(names)
     if factor == 1.0 and not layers:
         return bitmap
-    pixels = np.array(bitmap, dtype=np.float32).reshape(*np.array(bitmap).shape[:2], -1)
+    pixels = np.array(bitmap, dtype=np.float32)
+    pixels = pixels.reshape(*pixels.shape[:2], -1)
     for index, name in enumerate(names):
         if name in (*channels.RGB, "Y", *layers):
             pixels[..., index] *= factor

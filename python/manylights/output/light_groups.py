@@ -42,10 +42,16 @@ def add_up(pixels: np.ndarray, names: list[str]) -> None:
         pixels: shape (height, width, channels), single precision.
         names: of the channels.
     """
-    for color in RGB:
-        layers = [pixels[..., names.index(name)] for name in of_color(names, color)]
-        if layers and color in names:
-            pixels[..., names.index(color)] = total(layers)
+    planes = {name: pixels[..., index] for index, name in enumerate(names)}
+    for color, plane in sums(planes).items():
+        if color in planes:
+            planes[color][...] = plane
+
+
+def sums(planes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the sums of the layers among some channels, by colour; none if there are no layers."""
+    layers = {color: [planes[name] for name in of_color(planes, color)] for color in RGB}
+    return {color: total(found) for color, found in layers.items() if found}
 
 
 def total(layers: list[np.ndarray]) -> np.ndarray:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from manylights import loading
 from manylights.loading import light_groups
 from manylights.loading.integrators import Wish
 from manylights.output import channels, images
@@ -69,15 +68,19 @@ class Extras:
             denoising.check_installed()
         return extras
 
-    def load(self, scene, integrator):
-        """Return the scene with the channels that are wanted of its integrator, and that to use."""
+    def parameters(self, option: str = "aovs") -> dict[str, str]:
+        """Return the parameters of our integrators for the channels that are wanted of them.
+
+        Args:
+            option: what ``aovs`` were given with, for messages.
+        """
         wanted = denoising.with_guides(self.aovs) if self.denoise else self.aovs
-        added = {} if wanted is None else {"aovs": channels.aov_list(wanted)}
+        added = {} if wanted is None else {"aovs": channels.aov_list(wanted, option)}
         if added and self.aovs is None:
             added["aovs"] = Wish(added["aovs"])
         if self.light_groups is not None:
             added[light_groups.PARAMETER] = light_groups.as_text(self.light_groups)
-        return loading.as_loaded(scene, integrator, added)
+        return added
 
     def prepare(self, job: Job, target: Path | None) -> Callable[[State], None] | None:
         """Return what shows a state in tev, ``None`` without.

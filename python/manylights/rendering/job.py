@@ -17,8 +17,9 @@ from manylights.errors import UsageError
 from manylights.loading import LoadedScene, light_groups
 from manylights.output import images
 from manylights.rendering import plan as plans
-from manylights.rendering.driver import ENTRIES, Driver
+from manylights.rendering.driver import ENTRIES, Driver, Report
 from manylights.rendering.parts import WHOLE, Part
+from manylights.rendering.state import State
 from manylights.rendering.targets import MOST_SPP, Course, History
 
 #: Of the files that keep the state of a job; another one is refused.
@@ -109,6 +110,15 @@ class Job:
         """Return the seed of a step: that of its sequence."""
         number = step.scramble if self.course.limits.indexed else step.index
         return plans.seed_of(self.seed, number)
+
+    def render(self, step: plans.Step, report: Report = lambda done: None) -> np.ndarray:
+        """Render a step with its random numbers; return the film's sums (``Driver.render``)."""
+        return self.driver.render(step, self.seed_of(step), self.course.spp, report)
+
+    def add_nothing(self, state: State) -> None:
+        """Make the film, which no step has made, and the sums if there are none."""
+        state.sums[0].add(self.driver.blank())
+        state.channels = self.driver.channels()
 
     def notes(self, done: History, noise: float | None) -> list[str]:
         """Return what is to be said at the end of a render."""

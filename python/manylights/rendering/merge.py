@@ -5,7 +5,6 @@ The scene is not needed: the files say how the film makes its image of the sums.
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from manylights.errors import UsageError
-from manylights.output import channels, exr, images, light_groups
+from manylights.output import channels, images, light_groups
 from manylights.output import denoise as denoising
 from manylights.rendering import metadata, state_file
 from manylights.rendering.develop import WEIGHT, develop
@@ -181,8 +180,8 @@ class _Parts:
             previews, notes = images.write_preview(bitmap, target, stops=stops)
             merged.files = [state_file.write(saved), *previews]
         else:
-            own = _signature(self.facts, [self.facts["seed"]], samples)
-            notes = _write(merged, target, {}, own, denoise, stops)
+            seeds = [self.facts["seed"]]
+            notes = _write(merged, target, {}, self.facts, seeds, denoise, stops)
         merged.notes += notes
         return merged
 
@@ -232,7 +231,13 @@ def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
 
 
 def _write(
-    merged: Merged, target: Path, layers: dict, own: dict, denoise: bool, stops: float
+    merged: Merged,
+    target: Path,
+    layers: dict,
+    facts: dict,
+    seeds: list[int],
+    denoise: bool,
+    stops: float,
 ) -> list[str]:
     """Write the image of finished parts or images; return notes about that."""
     names, shown = channels.names(merged.bitmap), None
@@ -241,11 +246,11 @@ def _write(
         kinds = (*denoising.GUIDES, denoising.EMISSION)
         guides = [name for name in layers if name.startswith(kinds)]
         planes = [pixels, *(layers[name][..., np.newaxis] for name in guides)]
-        exposure = float(json.loads(own[exr.OURS + "exposure"]))
         pixels = np.concatenate(planes, axis=2)
-        shown = denoising.denoised(pixels, [*names, *guides], exposure)
+        shown = denoising.denoised(pixels, [*names, *guides], float(facts["exposure"]))
         layers = layers | channels.color_layers(channels.DENOISED, shown)
-    number = np.float16 if json.loads(own[exr.OURS + "number"]) == "float16" else np.float32
+    own = _signature(facts, seeds, merged.samples)
+    number = np.float16 if facts["number"] == "float16" else np.float32
     merged.files, notes = images.write_images(
         merged.bitmap, target, layers, own, number, merged.samples, shown, stops
     )
@@ -263,7 +268,9 @@ def _merge_images(
     """Return the mean of finished images."""
     facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
     names = [name for name in planes if channels.is_averaged(name)]
-    total = {name: np.zeros(plane.shape) for name, plane in planes.items() if name in names}
+    # The variance of a mean: weights are squared
+    powers = {name: 2 if name.startswith(channels.VARIANCE) else 1 for name in names}
+    total = {name: np.zeros(planes[name].shape) for name in names}
     samples, saved = 0, first
     for path in [None, *paths]:
         if path is not None:
@@ -272,28 +279,20 @@ def _merge_images(
             _check_image(saved, found, first, names, owners)
         weight = saved.facts["samples_done"]
         for name in names:
-            # The variance of a mean: weights are squared
-            power = 2 if name.startswith(channels.VARIANCE) else 1
-            total[name] += planes[name].astype(np.float64) * float(weight) ** power
+            total[name] += planes[name].astype(np.float64) * float(weight) ** powers[name]
         samples += weight
-    means = {
-        name: total[name] / float(samples) ** (2 if name.startswith(channels.VARIANCE) else 1)
-        for name in names
-    }
+    means = {name: total[name] / float(samples) ** powers[name] for name in names}
     shown = channels.shown(names)
     layers = {name: means[name].astype(np.float32) for name in names if name not in shown}
     pixels = np.stack([means[name] for name in shown], axis=-1).astype(np.float32)
-    for index, color in enumerate(shown):
-        groups = light_groups.of_color(layers, color)
-        if groups:
-            pixels[..., index] = light_groups.total([layers[name] for name in groups])
+    for color, plane in light_groups.sums(layers).items():
+        pixels[..., shown.index(color)] = plane
     bitmap = channels.join(shown, pixels)
     count = 1 + len(paths)
     text = f"images: the mean of {count}, weighted by samples; their sums are not in the files"
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
-        own = _signature(facts, sorted(owners), samples)
-        merged.notes += _write(merged, target, layers, own, denoise, stops)
+        merged.notes += _write(merged, target, layers, facts, sorted(owners), denoise, stops)
     return merged
 
 

@@ -13,7 +13,7 @@ from manylights.errors import UsageError
 from manylights.output import channels, exr, images, light_groups
 
 #: What is true of the image as it was rendered alone.
-OF_THE_RENDER = ("variance.", "denoised.")
+OF_THE_RENDER = (channels.VARIANCE, channels.DENOISED)
 
 #: Facts about it that are not those of a mix.
 OWN_FACTS = ("noise",)
@@ -68,10 +68,7 @@ def mix(
             raise UsageError(f"{path}: no light group {name}, it has {', '.join(groups)}")
     kept = {name: plane for name, plane in planes.items() if not name.startswith(OF_THE_RENDER)}
     _multiply(kept, factors)
-    for color in channels.RGB:
-        kept[color] = light_groups.total(
-            [kept[name] for name in light_groups.of_color(kept, color)]
-        )
+    kept |= light_groups.sums(kept)
     mixed = Mixed(np.stack([kept[color] for color in channels.RGB], axis=-1))
     dropped = sorted({name.partition(".")[0] for name in planes.keys() - kept.keys()})
     if dropped:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from manylights import loading
 from manylights.errors import UsageError
 from manylights.output import channels, images
 from manylights.rendering import checkpoint as checkpoints
@@ -132,7 +133,7 @@ def render(
     """
     target = None if output is None else images.check_output(str(output))
     wanted = Extras.of(extras, part)
-    loaded, own = wanted.load(scene, integrator)
+    loaded, own = loading.as_loaded(scene, integrator, wanted.parameters())
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
@@ -256,13 +257,11 @@ def run(
         history.seconds += clock() - start
         while (step := job.course.next_step(history)) is not None:
             start = clock()
-            seed = job.seed_of(step)
-            raw = driver.render(step, seed, job.course.spp, lambda done: tell(done, step.spp))
+            raw = job.render(step, lambda done: tell(done, step.spp))
             state.channels = state.channels or driver.channels()
             state.add(step, raw, clock() - start)
             if job.course.round_is_complete(history):
-                spread = state.spread(driver.adjoint)
-                history.noises.append(spread.noise if spread else float("nan"))
+                state.end_round(driver.adjoint)
             # What the sums took is part of the time, too.
             history.add_seconds(clock() - start - history.last_seconds)
             start = clock()
@@ -278,20 +277,14 @@ def run(
     finally:
         driver.end()
     if history.steps == begun:
-        _add_nothing(job, state)
+        job.add_nothing(state)
 
 
 def _learn(job: Job, state: State) -> None:
     """Learn what the first step teaches, if this part does not have it."""
-    driver, step = job.driver, job.course.training(state.history)
+    step = job.course.training(state.history)
     if step is not None and not state.learnt.size:
-        driver.render(step, job.seed_of(step), job.course.spp, lambda done: None)
-
-
-def _add_nothing(job: Job, state: State) -> None:
-    """Make the film, which no step has made, and the sums if there are none."""
-    state.sums[0].add(job.driver.blank())
-    state.channels = job.driver.channels()
+        job.render(step)
 
 
 def result_of(job: Job, state: State) -> RenderResult:

@@ -35,6 +35,11 @@ class State:
         """Return the state before the first step."""
         return State([Sums() for _ in range(sequences)], History([0] * sequences))
 
+    def end_round(self, adjoint: bool) -> None:
+        """Add the noise of a round that is complete to the history."""
+        spread = self.spread(adjoint)
+        self.history.noises.append(spread.noise if spread else float("nan"))
+
     def add(self, step: Step, raw: np.ndarray, seconds: float) -> None:
         """Add the film's sums of a step that took so long."""
         self.sums[step.scramble].add(raw)

@@ -91,13 +91,11 @@ class Foreman:
         """Render all rounds: one without a noise as the target."""
         course, history = self.job.course, self.state.history
         # Also without a step the film has its size and channels.
-        self.state.sums[0].add(self.job.driver.blank())
-        self.state.channels = self.job.driver.channels()
+        self.job.add_nothing(self.state)
         while steps := list(course.open_steps(history)):
             self._run_round(steps)
             if course.round_is_complete(history):
-                spread = self.state.spread(self.job.driver.adjoint)
-                history.noises.append(spread.noise if spread else float("nan"))
+                self.state.end_round(self.job.driver.adjoint)
         history.seconds = self.before + self._spent()
 
     def keep(self) -> None:

@@ -163,7 +163,7 @@ def _render(key: str, engagement: Engagement, steps: list[Step]) -> dict[int, Su
     if not engagement.taught and not steps[0].trains:
         lesson = job.course.lesson()
         if lesson is not None:
-            job.driver.render(lesson, job.seed_of(lesson), job.course.spp, lambda done: None)
+            job.render(lesson)
     engagement.taught = True
     result: dict[int, Sums] = {}
     for index, step in enumerate(steps):
@@ -171,8 +171,7 @@ def _render(key: str, engagement: Engagement, steps: list[Step]) -> dict[int, Su
             return None
         tell = _teller(own, key, index)
         tell(0.0)
-        raw = job.driver.render(step, job.seed_of(step), job.course.spp, tell)
-        result.setdefault(step.scramble, Sums()).add(raw)
+        result.setdefault(step.scramble, Sums()).add(job.render(step, tell))
     return result
 
 
