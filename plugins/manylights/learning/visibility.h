@@ -20,6 +20,7 @@
  * so that their sums do not depend on an order.
  */
 
+#include "manylights/base/recording.h"
 #include "manylights/receiver/receiver.h"
 #include <atomic>
 #include <mitsuba/core/random.h>
@@ -44,8 +45,9 @@ constexpr float kLeastCell = 1e-4f, kLargestCell = .125f;
 constexpr float kJitter = .5f;
 
 /// What the size of cells depends on: the camera's position and the scene's diagonal
-struct CellSize {
-    float camera[3], scene;
+template <typename Float> struct CellSize {
+    mitsuba::Point<Float, 3> camera;
+    Float scene;
 };
 
 /// The least gain (\ref VisibilityTable::learn) for which it is worth looking visibility up
@@ -89,9 +91,9 @@ public:
         std::conditional_t<dr::is_jit_v<Float>, UInt32, dr::DynamicArray<UInt32>>;
 
     /// @param records  a power of two
-    VisibilityTable(uint32_t records, const CellSize &size)
-        : m_records(records), m_camera(size.camera[0], size.camera[1], size.camera[2]),
-          m_scene(size.scene), m_counting(true), m_factors(dr::zeros<Storage>(records)) {
+    VisibilityTable(uint32_t records, const CellSize<Float> &size)
+        : m_records(records), m_camera(size.camera), m_scene(size.scene),
+          m_counting(true), m_factors(dr::zeros<Storage>(records)) {
         if constexpr (dr::is_jit_v<Float>) {
             m_counts = dr::zeros<UInt32>(records * kCounts);
             m_cells  = dr::zeros<UInt32>(records);
@@ -155,8 +157,8 @@ public:
      * what those knew that shared it, and cells as large as its camera deserves. Where these
      * are as large as before they are still known.
      */
-    void prepare(uint32_t records, const CellSize &size) {
-        m_camera = { size.camera[0], size.camera[1], size.camera[2] };
+    void prepare(uint32_t records, const CellSize<Float> &size) {
+        m_camera = size.camera;
         m_scene  = size.scene;
         dr::make_opaque(m_camera, m_scene);
         if (records <= m_records)
@@ -224,21 +226,27 @@ public:
     void set_counting(bool on) { m_counting = dr::opaque<Mask>(on); }
 
     /**
-     * Make factors of the counts. Returns what they promise: with rays in proportion to F, the
-     * variance of choosing a child is in proportion to sum(n v) sum(n), and (sum(n sqrt(v)))^2
-     * if the choice knows v. The result is the mean logarithm of the ratio over the rays.
+     * Make factors of the counts. Returns if they are worth it: with rays in proportion to F,
+     * the variance of choosing a child is in proportion to sum(n v) sum(n), and
+     * (sum(n sqrt(v)))^2 if the choice knows v. Their gain is the mean logarithm of the ratio
+     * over the rays. A function that is recorded cannot read it: without gain all factors are 1.
      *
      * @param nodes        how many the tree has
      * @param parent_link  of a node: 4 * parent + slot, kNone for the root
      */
     template <typename ParentLink>
-    float learn(uint32_t nodes, const ParentLink &parent_link) {
+    bool learn(const UInt32 &nodes, const ParentLink &parent_link) {
         if constexpr (dr::is_jit_v<Float>) {
             Summary all = summarize(dr::arange<UInt32>(m_records), nodes, parent_link);
             Float rays = dr::sum(all.rays), gain = dr::sum(all.gain);
             m_factors = all.word;
+            if (is_recorded<Float>()) {
+                m_factors &= gain / dr::maximum(rays, 1.f) >= kLeastGain;
+                dr::eval(m_factors);
+                return true;
+            }
             dr::eval(m_factors, rays, gain);
-            return gain[0] / std::max(rays[0], 1.f);
+            return gain[0] / std::max(rays[0], 1.f) >= kLeastGain;
         } else {
             double rays = 0, gain = 0;
             for (uint32_t r = 0; r < m_records; ++r) {
@@ -247,7 +255,7 @@ public:
                 gain += record.gain;
                 m_factors.data()[r] = record.word;
             }
-            return (float) (gain / std::max(rays, 1.));
+            return (float) (gain / std::max(rays, 1.)) >= kLeastGain;
         }
     }
 
@@ -309,8 +317,8 @@ private:
     /// The share of the rays below a node that arrive; what is known of its parent counts as
     /// kRaysOfParent rays, and above the root all arrive
     template <typename ParentLink>
-    Float arriving(const UInt32 &record, uint32_t nodes, const ParentLink &parent_link,
-                   const Mask &active) const {
+    Float arriving(const UInt32 &record, const UInt32 &nodes,
+                   const ParentLink &parent_link, const Mask &active) const {
         struct State {
             UInt32 node;
             Float share, weight;
@@ -340,7 +348,7 @@ private:
     }
 
     template <typename ParentLink>
-    Summary summarize(const UInt32 &record, uint32_t nodes,
+    Summary summarize(const UInt32 &record, const UInt32 &nodes,
                       const ParentLink &parent_link) const {
         auto counts = read(record, Mask(true));
         Float rays  = rays_of(counts).second, sum_v(0.f), sum_root(0.f);

@@ -298,7 +298,11 @@ private:
     }
 
     void intersect(State &s, bool coherent) const {
-        s.pi = m_scene->ray_intersect_preliminary(s.ray, coherent, s.active);
+        // As `path` does it: GPUs sort scattered rays by the shapes that they meet
+        bool reorder = !coherent && jit_flag(JitFlag::SymbolicLoops);
+        s.pi = m_scene->ray_intersect_preliminary(s.ray, coherent, reorder,
+                                                  /* reorder_hint = */ 0u,
+                                                  /* reorder_hint_bits = */ 0, s.active);
         if (m_limits.hide_emitters && coherent && !m_media)
             skip_emitters(m_scene, s.ray, s.pi, s.active);
     }

@@ -8,11 +8,11 @@
 
 #include "group_levels.h"
 #include "manylights/base/host_view.h"
+#include "manylights/base/recording.h"
 #include "manylights/choice/parameters.h"
 #include "manylights/scene/scene_lights.h"
 #include "pass_plan.h"
 #include "passes.h"
-#include <cmath>
 #include <mitsuba/render/sensor.h>
 
 namespace manylights {
@@ -36,6 +36,8 @@ public:
         LearningPasses &m_learning;
     };
 
+    MANYLIGHTS_TRAVERSE(m_counts)
+
     void traverse(mitsuba::TraversalCallback *cb) {
         cb->put("visibility.counts", m_counts, mitsuba::ParamFlags::NonDifferentiable);
     }
@@ -45,6 +47,9 @@ public:
         m_frozen    = dr::width(m_counts) > 0;
         m_continues = false;
     }
+
+    /// Are the counts those that were written?
+    bool is_written() const { return m_frozen; }
 
     /// The next rendering knows nothing of those before
     void forget() {
@@ -83,12 +88,14 @@ public:
         }
         if (!anew && !m_frozen && !(m_continues || keeps()))
             return;
+        if (is_recorded<Float>())
+            refuse_recording(lights, job);
         m_lights = &lights;
         if (anew) {
-            lights.start_learning(scene, cell_size(scene, sensor), samples, keeps());
+            lights.start_learning(scene, sensor, samples, keeps());
             m_frozen = false;
         } else if (m_frozen && !(m_continues && lights.learner().count_size() > 0)) {
-            lights.start_learning(scene, cell_size(scene, sensor), samples, false);
+            lights.start_learning(scene, sensor, samples, false);
             write_counts();
         }
         m_continues = job;
@@ -160,6 +167,20 @@ private:
         return dr::load<Counts>(numbers.data(), numbers.size());
     }
 
+    /// What is read on the host, or kept from one rendering to the next
+    void refuse_recording(const Lights &lights, bool job) const {
+        const char *what = job       ? "a \"plan\" whose passes learn visibility"
+                           : keeps() ? "\"learn_visibility\" = \"keep\""
+                           : lights.groups().count() > 0
+                               ? "\"light_groups\" whose brightness is learnt"
+                               : nullptr;
+        if (what)
+            throw std::runtime_error(
+                "manylights: dr.freeze cannot record " + std::string(what) +
+                ": what has been learnt is read by the host. Give the integrator "
+                "\"learn_visibility\" = false.");
+    }
+
     [[noreturn]] void refuse_counts(size_t size) const {
         std::string allowed =
             size ? std::to_string(size) +
@@ -168,23 +189,6 @@ private:
         throw std::runtime_error("manylights: \"visibility.counts\" has " +
                                  std::to_string(dr::width(m_counts)) +
                                  " numbers, but must have " + allowed + ".");
-    }
-
-    static CellSize cell_size(const Scene *scene, const Sensor *sensor) {
-        CellSize result;
-        auto camera = sensor->world_transform().translation();
-        for (size_t i = 0; i < 3; ++i) {
-            if constexpr (dr::is_jit_v<Float>)
-                result.camera[i] = (float) dr::slice(dr::detach(camera.entry(i)));
-            else
-                result.camera[i] = (float) camera.entry(i);
-        }
-        // In double precision, where squares of all units fit; places without sense do not count
-        double diagonal = 0;
-        for (double extent : scene->bbox().extents())
-            diagonal += std::isfinite(extent) ? extent * extent : 0;
-        result.scene = (float) std::sqrt(diagonal);
-        return result;
     }
 
     const SamplingParameters &m_params;

@@ -104,6 +104,28 @@ public:
         m_learning.traverse(cb);
     }
 
+    void traverse_1_cb_ro(void *payload,
+                          dr::detail::traverse_callback_ro fn) const override {
+        if constexpr (dr::is_jit_v<Float>) {
+            if (!jit_flag(JitFlag::EnableObjectTraversal))
+                return;
+            if (!is_recorded<Float>())
+                prepare_recording();
+            Base::traverse_1_cb_ro(payload, fn);
+            DRJIT_MAP(DR_TRAVERSE_MEMBER_RO, m_facts, m_cache, m_learning,
+                      m_shape_numbers)
+        }
+    }
+    void traverse_1_cb_rw(void *payload, dr::detail::traverse_callback_rw fn) override {
+        if constexpr (dr::is_jit_v<Float>) {
+            if (!jit_flag(JitFlag::EnableObjectTraversal))
+                return;
+            Base::traverse_1_cb_rw(payload, fn);
+            DRJIT_MAP(DR_TRAVERSE_MEMBER_RW, m_facts, m_cache, m_learning,
+                      m_shape_numbers)
+        }
+    }
+
     void parameters_changed(const std::vector<std::string> &keys) override {
         Base::parameters_changed(keys);
         auto written = [&](std::string_view name) {
@@ -168,6 +190,19 @@ private:
                                         Wavefronts<Float, Spectrum, LightIntegrator>,
                                         OrderedBlocks<Float, Spectrum, LightIntegrator>>;
     static constexpr uint32_t kOnePass = (uint32_t) -1; // Mitsuba's default
+
+    /// Before a function is recorded or replayed
+    void prepare_recording() const {
+        TraversalUnlock unlock;
+        Hash facts;
+        facts.mix(m_cache.prepare_recording());
+        facts.mix(m_learning.is_written());
+        for (const PlannedPass &pass : m_plan)
+            for (uint32_t number :
+                 { pass.first, pass.count, (uint32_t) pass.role, pass.scramble })
+                facts.mix(number);
+        m_facts.set(facts.value);
+    }
 
     void prepare_channels(const Scene *scene, const Film *film) const {
         if (has_flag(film->flags(), mitsuba::FilmFlags::Special) && !aov_names().empty())
@@ -245,8 +280,9 @@ private:
         log_start(size, spp, plan.size());
         typename Learning::Session session(m_learning);
         m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
-        bool shows_lamps =
-            shows_emitters() && !has_flag(film->flags(), mitsuba::FilmFlags::Special);
+        // Chosen on the host: in functions that are recorded camera rays alone find lamps
+        bool shows_lamps = shows_emitters() && !is_recorded<Float>() &&
+                           !has_flag(film->flags(), mitsuba::FilmFlags::Special);
         LampPasses<Float, Spectrum> lamps(m_lamps, lights, scene, sensor, shows_lamps,
                                           media(lights, scene, sensor->medium()),
                                           m_channels);
@@ -308,6 +344,7 @@ private:
     PassPlan m_plan;
     Learning m_learning;
     ShapeNumbers<Float, Spectrum> m_shape_numbers;
+    mutable HostFacts<dr::uint32_array_t<dr::detached_t<Float>>> m_facts;
 };
 
 } // namespace manylights

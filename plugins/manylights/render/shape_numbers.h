@@ -2,6 +2,7 @@
 
 /// The numbers of a scene's shapes, from 1 in the order of `scene.shapes()`.
 
+#include "manylights/base/recording.h"
 #include <memory>
 #include <mitsuba/render/interaction.h>
 #include <mitsuba/render/scene.h>
@@ -16,12 +17,16 @@ public:
 
     /// Of a scene, whose shapes may have changed
     void prepare(const Scene *scene) const {
-        std::atomic_store(&m_table, std::make_shared<const Table>(scene));
+        // Those of a function that is recorded are loaded before
+        if (!is_recorded<Float>() || !m_table || !m_table->is_of(scene))
+            std::atomic_store(&m_table, std::make_shared<Table>(scene));
     }
+
+    MANYLIGHTS_TRAVERSE(m_table)
 
     /// The number of what was hit, of the instance if it is part of one; 0 for nothing
     UInt32 at(const Scene *scene, const SurfaceInteraction3f &si, Mask active) const {
-        std::shared_ptr<const Table> table = std::atomic_load(&m_table);
+        std::shared_ptr<Table> table = std::atomic_load(&m_table);
         if (!table || !table->is_of(scene)) {
             prepare(scene);
             table = std::atomic_load(&m_table);
@@ -45,6 +50,8 @@ private:
         std::conditional_t<dr::is_jit_v<Float>, UInt32,
                            std::unordered_map<const Shape *, uint32_t>>
             numbers;
+
+        MANYLIGHTS_TRAVERSE(numbers)
 
         explicit Table(const Scene *scene) : shapes(scene->shapes()) {
             uint32_t number = 0;
@@ -73,7 +80,7 @@ private:
     };
 
     /// Of the scene that was asked about last; threads may ask at the same time
-    mutable std::shared_ptr<const Table> m_table;
+    mutable std::shared_ptr<Table> m_table;
 };
 
 } // namespace manylights

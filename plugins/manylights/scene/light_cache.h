@@ -11,6 +11,9 @@
  * ray of an integrator around this one (`moment`, `stokes`), only when a thread comes with
  * another sampler. Such renderings fork one for each part of an image; the sampler of a
  * program, which may change the scene between two calls, is known by belonging to Python.
+ *
+ * A function that dr.freeze records cannot build lights: they are brought up to date before, whenever
+ * dr.freeze looks for the arrays that the function depends on.
  */
 
 #include "manylights/choice/parameters.h"
@@ -30,9 +33,8 @@ namespace manylights {
 
 template <typename Float, typename Spectrum> class LightCache {
 public:
-    using Lights  = SceneLights<Float, Spectrum>;
-    using Scene   = mitsuba::Scene<Float, Spectrum>;
-    using Sampler = mitsuba::Sampler<Float, Spectrum>;
+    using Lights = SceneLights<Float, Spectrum>;
+    MI_IMPORT_TYPES(Scene, Sampler, EmitterPtr, ShapePtr)
 
     explicit LightCache(const SamplingParameters &params) : m_params(params) {}
 
@@ -40,6 +42,9 @@ private:
     /// The lights of a scene as it was; those who use them keep it
     struct Entry {
         const Scene *scene;
+        /// The arrays of a scene that lives belong to it, too, and tell it from others
+        mitsuba::DynamicBuffer<EmitterPtr> emitters;
+        mitsuba::DynamicBuffer<ShapePtr> shapes;
         Fingerprint<Float> fingerprint;
         mitsuba::ref<Lights> lights;
         /// How many calls of `render()` have checked these lights and go on
@@ -47,7 +52,18 @@ private:
 
         Entry(const Scene *scene, Fingerprint<Float> &&fingerprint,
               mitsuba::ref<Lights> lights)
-            : scene(scene), fingerprint(std::move(fingerprint)), lights(lights) {}
+            : scene(scene), emitters(scene->emitters_dr()), shapes(scene->shapes_dr()),
+              fingerprint(std::move(fingerprint)), lights(lights) {}
+
+        bool has_scene() const {
+            if constexpr (dr::is_jit_v<Float>)
+                return (!emitters.index() || jit_var_ref(emitters.index()) > 1) &&
+                       (!shapes.index() || jit_var_ref(shapes.index()) > 1);
+            else
+                return true;
+        }
+
+        MANYLIGHTS_TRAVERSE(emitters, shapes, lights)
     };
     using EntryPtr = std::shared_ptr<Entry>;
 
@@ -113,6 +129,29 @@ public:
             }
     }
 
+    /// Bring the lights of all scenes up to date. Returns what is no array, see HostFacts
+    uint64_t prepare_recording() const {
+        std::lock_guard<std::mutex> guard(m_mutex);
+        const Scene *current = m_current ? m_current->scene : nullptr;
+        Hash facts;
+        for (EntryPtr &entry : m_entries) {
+            if (entry && !entry->has_scene())
+                entry.reset();
+            if (entry && entry->renderings == 0)
+                update(entry->scene);
+            facts.mix(entry != nullptr);
+            if (entry)
+                entry->lights->add_facts(facts, m_params);
+        }
+        for (EntryPtr &entry : m_entries)
+            if (entry && entry->scene == current)
+                m_current = entry;
+        return facts.value;
+    }
+
+    /// What dr.freeze has to know
+    MANYLIGHTS_TRAVERSE(m_entries)
+
     /// Expose the size of the current tree, read-only
     void traverse(mitsuba::TraversalCallback *cb) {
         auto read_only = mitsuba::ParamFlags::ReadOnly;
@@ -167,14 +206,23 @@ private:
 
     /// Make the lights of a scene current, and build or refit them if they are new or changed
     EntryPtr update(const Scene *scene) const {
-        refuse_freezing();
+        bool recorded = is_recorded<Float>();
+        RecordingPause<Float> pause;
         Fingerprint<Float> fingerprint = scene_fingerprint<Float, Spectrum>(scene);
         for (const EntryPtr &entry : m_entries)
             if (entry && entry->scene == scene &&
-                (entry->fingerprint == fingerprint || refit(*entry, fingerprint)))
+                (entry->fingerprint == fingerprint ||
+                 (!recorded && refit(*entry, fingerprint)))) {
+                if (!recorded)
+                    entry->lights->set_size(scene);
                 return m_current = entry;
+            }
+        if (recorded)
+            refuse_recording(scene);
         fingerprint.hold();
-        return m_current = build(scene, std::move(fingerprint));
+        m_current = build(scene, std::move(fingerprint));
+        m_current->lights->set_size(scene);
+        return m_current;
     }
 
     /// If emitters have only become brighter or darker, and nobody uses the lights
@@ -215,13 +263,21 @@ private:
         return m_entries[slot];
     }
 
-    static void refuse_freezing() {
-        if constexpr (dr::is_jit_v<Float>)
-            if (jit_flag(JitFlag::FreezingScope))
-                throw std::runtime_error("manylights: rendering cannot be recorded by "
-                                         "dr.freeze, because the light "
-                                         "tree is built on the host. Call mi.render "
-                                         "outside of the frozen function.");
+    [[noreturn]] void refuse_recording(const Scene *scene) const {
+        for (const EntryPtr &entry : m_entries)
+            if (entry && entry->scene == scene)
+                throw std::runtime_error(
+                    "manylights: the lights of the scene have changed within the "
+                    "function "
+                    "that dr.freeze records, but their tree is built on the host. Change "
+                    "them outside of the frozen function, and give it the integrator as "
+                    "an "
+                    "argument.");
+        throw std::runtime_error(
+            "manylights: dr.freeze cannot record how the light tree of a scene is built, "
+            "because that is done on the host. Before the first call, call mi.render "
+            "outside of the frozen function, with the same scene and integrator and one "
+            "sample per pixel.");
     }
 
     static std::string describe(const Statistics &s) {

@@ -6,6 +6,7 @@
  * their layers. Empty where no groups are asked for: nothing may be looked up then.
  */
 
+#include "fingerprint.h"
 #include "manylights/choice/group_names.h"
 #include "manylights/tree/tree_view.h"
 #include <algorithm>
@@ -27,6 +28,8 @@ public:
     using Tree         = TreeView<FloatD>;
     using Storage      = typename Tree::Storage;
     using IndexStorage = typename Tree::IndexStorage;
+
+    MANYLIGHTS_TRAVERSE(m_emitters, m_infinite, m_shapes, m_evening)
 
     LightGroups() = default;
 
@@ -52,6 +55,13 @@ public:
 
     /// How many groups there are, 0 if none are asked for
     uint32_t count() const { return m_count; }
+
+    /// What is no array, see HostFacts
+    void add_facts(Hash &facts) const {
+        for (size_t fact : { (size_t) m_count, (size_t) m_environment,
+                             (size_t) dr::width(m_shapes), m_levels.size() })
+            facts.mix(fact);
+    }
 
     /// Of a light of the table
     UInt32D of_light(const Tree &tree, const UInt32D &light, const MaskD &active) const {

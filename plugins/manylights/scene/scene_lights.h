@@ -6,18 +6,20 @@
  */
 
 #include "light_groups.h"
+#include "manylights/choice/parameters.h"
 #include "media_kinds.h"
 #include "refit.h"
 #include "scene_lobes.h"
 #include "visibility_learner.h"
 #include <chrono>
+#include <cmath>
 #include <unordered_map>
 
 namespace manylights {
 
 template <typename Float, typename Spectrum> class SceneLights : public mitsuba::Object {
 public:
-    MI_IMPORT_TYPES(Scene, Emitter, EmitterPtr, Shape, ShapePtr)
+    MI_IMPORT_TYPES(Scene, Sensor, Emitter, EmitterPtr, Shape, ShapePtr)
     using FloatD  = dr::detached_t<Float>;
     using UInt32D = dr::uint32_array_t<FloatD>;
     using MaskD   = dr::mask_t<FloatD>;
@@ -67,7 +69,8 @@ public:
         tree.node_link.push_back(kNone);
         m_tree.node_links =
             dr::load<IndexStorage>(tree.node_link.data(), tree.node_link.size());
-        m_tree.binary = or_empty(dr::load<Storage>(
+        m_tree.node_count = dr::opaque<UInt32D>((uint32_t) tree.node_link.size());
+        m_tree.binary     = or_empty(dr::load<Storage>(
             tree.binary.data(), tree.binary.size() * kBinaryNodeFloats));
         // Put rows and primitives into the order of the tree
         make_rows(table, tree);
@@ -86,6 +89,16 @@ public:
              dr::width(m_tree.binary) + dr::width(m_tree.rows) +
              dr::width(m_light_of_primitive) + dr::width(m_shape_lights));
         m_statistics.build_ms = stopwatch.milliseconds();
+    }
+
+    /// Follow a change of the scene's size
+    void set_size(const Scene *scene) {
+        // In double precision, where squares of all units fit; places without sense do not count
+        double squares = 0;
+        for (double extent : scene->bbox().extents())
+            squares += std::isfinite(extent) ? extent * extent : 0;
+        if (float diagonal = (float) std::sqrt(squares); diagonal != m_host_diagonal)
+            m_diagonal = dr::opaque<FloatD>(m_host_diagonal = diagonal);
     }
 
     using Change = typename Fingerprint<Float>::Change;
@@ -125,8 +138,11 @@ public:
     using Learner = VisibilityLearner<Float, Spectrum>;
     /// What is learnt of the lights' visibility; after a change kernels use what it says
     const Learner &learner() const { return m_learner; }
-    void start_learning(const Scene *scene, const CellSize &size, double samples,
+    void start_learning(const Scene *scene, const Sensor *sensor, double samples,
                         bool keep) {
+        auto camera = sensor->world_transform().translation();
+        CellSize<FloatD> size{ mitsuba::Point<FloatD, 3>(plain(Point3f(camera))),
+                               m_diagonal };
         m_learner.start(scene, size, m_statistics.nodes, samples, keep);
     }
     template <typename Change> void change_learner(const Change &change) {
@@ -184,6 +200,23 @@ public:
         }
     }
 
+    /// What is no array, see HostFacts
+    void add_facts(Hash &facts, const SamplingParameters &params) const {
+        bool all = params.considers_all(m_tree.light_count);
+        for (size_t fact :
+             { (size_t) all, all ? (size_t) m_tree.light_count : 0,
+               (size_t) m_tree.kinds.bits, (size_t) m_tree.directions, (size_t) m_lobes,
+               (size_t) m_media.bits(), (size_t) m_needs_emitter_eval,
+               (size_t) m_can_be_hit, (size_t) dr::width(m_shape_lights),
+               (size_t) Learner::record_count(512. * m_statistics.nodes) })
+            facts.mix(fact);
+        for (const Emitter *emitter : m_infinite)
+            facts.mix(jit_registry_id(emitter));
+        m_groups.add_facts(facts);
+    }
+
+    MI_TRAVERSE_CB(mitsuba::Object, m_tree, m_light_of_primitive, m_shape_lights,
+                   m_infinite_dr, m_groups, m_diagonal)
     MI_DECLARE_CLASS(SceneLights)
 
 private:
@@ -284,6 +317,9 @@ private:
     std::string m_first_only_hit;
     Lobes m_lobes = Lobes::None;
     MediaKinds m_media;
+    /// Of the scene's bounding box
+    FloatD m_diagonal     = 0.f;
+    float m_host_diagonal = 0.f;
     Statistics m_statistics;
 };
 

@@ -24,12 +24,9 @@ public:
      * The table has 512 records for each of `nodes`, about as many as there are cells in sight,
      * but no more than `samples` are expected, and at most 42 MB.
      */
-    void start(const Scene *scene, const CellSize &size, uint32_t nodes, double samples,
-               bool keep) {
-        double wanted    = std::min(512. * nodes, samples);
-        uint32_t records = 1u << 12;
-        while (records < kMostRecords && records < wanted)
-            records *= 2;
+    void start(const Scene *scene, const CellSize<dr::detached_t<Float>> &size,
+               uint32_t nodes, double samples, bool keep) {
+        uint32_t records = record_count(std::min(512. * nodes, samples));
         Fingerprint<Float> shapes(0);
         if (keep)
             for_each_shape(scene, [&](const Shape *shape) { shapes.add_emitter(shape); });
@@ -43,6 +40,14 @@ public:
         }
     }
 
+    /// Records of a table that wants so many
+    static uint32_t record_count(double wanted) {
+        uint32_t records = 1u << 12;
+        while (records < kMostRecords && records < wanted)
+            records *= 2;
+        return records;
+    }
+
     /// Count the rays that follow, or use what was learnt so far, if that is worth it
     void count(bool on) {
         if (!m_table)
@@ -53,9 +58,8 @@ public:
 
     /// Make factors of the counts
     template <typename Tree> void learn(const Tree &tree) {
-        float gain = m_table->learn(
-            tree.node_count(), [&](const auto &node) { return tree.parent_link(node); });
-        m_worth_it = gain >= kLeastGain;
+        m_worth_it = m_table->learn(
+            tree.node_count, [&](const auto &node) { return tree.parent_link(node); });
     }
 
     /// What was counted, empty if there is no table

@@ -9,6 +9,7 @@
  * the first terms of the emission's spherical harmonics.
  */
 
+#include "manylights/base/recording.h"
 #include "manylights/receiver/lobes.h"
 #include "manylights/receiver/segment_view.h"
 
@@ -17,6 +18,8 @@ namespace manylights {
 /// The part of a wide node that the importance needs, for its four children
 template <typename Float> struct Clusters {
     Four<Float> mean[3], variance, flux, axis[3];
+
+    MANYLIGHTS_TRAVERSE(mean, variance, flux, axis)
 };
 
 /// Smallest factor by which the direction of emission may lower h

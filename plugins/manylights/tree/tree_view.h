@@ -37,6 +37,8 @@ template <typename Float> struct TopView {
     UInt32 node[4];
     Float share[4];
 
+    MANYLIGHTS_TRAVERSE(clusters, child, node, share)
+
     TopView() = default;
     explicit TopView(const TreeTop &top) {
         // Not as literals, which would be compiled anew for each scene
@@ -76,6 +78,8 @@ template <typename Float> struct TreeView {
     Storage nodes, binary, rows;
     /// 4 * parent + slot of the wide nodes
     IndexStorage node_links;
+    /// How many there are: no literal, so that scenes have one kernel
+    UInt32 node_count = 0;
     TopView<Float> top;
     uint32_t light_count = 0;
     /// A power of two that brings the largest flux to [1, 2), and its inverse: importances and
@@ -90,6 +94,8 @@ template <typename Float> struct TreeView {
     /// What has been learnt of the lights' visibility, null if that is not wanted
     const VisibilityTable<Float> *visibility = nullptr;
 
+    MANYLIGHTS_TRAVERSE(nodes, binary, rows, node_links, node_count, top, scale, unit)
+
     /// Gather the `Count` floats of entry `index`
     template <size_t Count>
     static dr::Array<Float, Count> fetch(const Storage &buffer, const UInt32 &index,
@@ -99,9 +105,6 @@ template <typename Float> struct TreeView {
         else
             return dr::load<dr::Array<Float, Count>>(buffer.data() + index * Count);
     }
-
-    /// How many wide nodes there are
-    uint32_t node_count() const { return (uint32_t) dr::width(node_links); }
 
     UInt32 parent_link(const UInt32 &node) const {
         if constexpr (dr::is_jit_v<Float>)
