@@ -14,6 +14,7 @@
 #include <mitsuba/core/transform.h>
 #include <mitsuba/core/vector.h>
 #include <string_view>
+#include <unordered_map>
 
 namespace manylights {
 
@@ -76,7 +77,13 @@ public:
         bool differentiated, was_differentiated;
     };
 
-    explicit Fingerprint(size_t emitters) { m_emitters.reserve(emitters); }
+    /// Variables that take the place of others
+    using Literals = std::unordered_map<uint32_t, uint32_t>;
+
+    explicit Fingerprint(size_t emitters, Literals literals = {})
+        : m_literals(std::move(literals)) {
+        m_emitters.reserve(emitters);
+    }
     Fingerprint(Fingerprint &&other) { swap(other); }
     Fingerprint &operator=(Fingerprint &&other) {
         swap(other);
@@ -146,6 +153,20 @@ public:
         return same;
     }
 
+    /// Variables that were literals in `other`, with the same value: dr.freeze makes arrays of them
+    Literals literals(const Fingerprint &other) const {
+        Literals result;
+        if constexpr (dr::is_jit_v<Float>) {
+            size_t count = std::min(m_variables.size(), other.m_variables.size());
+            for (size_t i = 0; i < count; ++i) {
+                uint32_t now = m_variables[i], before = other.m_variables[i];
+                if (now != before && has_become_array(before, now))
+                    result[now] = before;
+            }
+        }
+        return result;
+    }
+
     /// Emitters that emit something else than in `other`
     std::vector<Change> changed_emission(const Fingerprint &other) const {
         std::vector<Change> result;
@@ -168,9 +189,22 @@ private:
 
     // ------------------------------------------------------------------------- Values
 
+    static bool has_become_array(uint32_t literal, uint32_t array) {
+        VarInfo before = jit_var_info(literal), now = jit_var_info(array);
+        if (before.state != VarState::Literal || now.state != VarState::Evaluated ||
+            before.type != now.type || before.size != now.size)
+            return false;
+        uint64_t value = 0;
+        jit_var_read(array, now.size - 1, &value);
+        return value == before.literal;
+    }
+
     /// A changed parameter is a new variable; the upper half tells whether it has a gradient
     static void mix_variable(void *self, uint64_t index, const char *, const char *) {
         Fingerprint &out = *(Fingerprint *) self;
+        auto literal     = out.m_literals.find((uint32_t) index);
+        if (literal != out.m_literals.end())
+            index += (uint64_t) literal->second - (uint32_t) index;
         out.mix(index);
         Parts *parts = out.m_emitters.empty() ? nullptr : &out.m_emitters.back();
         if (parts && out.m_hash == &parts->emission)
@@ -265,6 +299,7 @@ private:
         "bsdf", "emitter", "sensor", "medium", "interior_medium", "exterior_medium"
     };
 
+    Literals m_literals;
     std::vector<Parts> m_emitters;
     Hash m_common;
     /// Where the current parameter belongs

@@ -206,23 +206,44 @@ private:
 
     /// Make the lights of a scene current, and build or refit them if they are new or changed
     EntryPtr update(const Scene *scene) const {
-        bool recorded = is_recorded<Float>();
-        RecordingPause<Float> pause;
+        if (is_recorded<Float>())
+            return m_current = recorded(scene);
         Fingerprint<Float> fingerprint = scene_fingerprint<Float, Spectrum>(scene);
         for (const EntryPtr &entry : m_entries)
             if (entry && entry->scene == scene &&
-                (entry->fingerprint == fingerprint ||
-                 (!recorded && refit(*entry, fingerprint)))) {
-                if (!recorded)
-                    entry->lights->set_size(scene);
+                (entry->fingerprint == fingerprint || refit(*entry, fingerprint))) {
+                entry->lights->set_size(scene);
                 return m_current = entry;
             }
-        if (recorded)
-            refuse_recording(scene);
         fingerprint.hold();
         m_current = build(scene, std::move(fingerprint));
         m_current->lights->set_size(scene);
         return m_current;
+    }
+
+    /// In a function that dr.freeze records: those that are up to date, or it cannot be recorded
+    EntryPtr recorded(const Scene *scene) const {
+        RecordingPause<Float> pause;
+        for (const EntryPtr &entry : m_entries) {
+            if (!entry || entry->scene != scene)
+                continue;
+            auto now = scene_fingerprint<Float, Spectrum>(scene);
+            if (entry->fingerprint == now ||
+                entry->fingerprint == scene_fingerprint<Float, Spectrum>(
+                                          scene, now.literals(entry->fingerprint)))
+                return entry;
+            throw std::runtime_error(
+                "manylights: the lights of the scene have changed within the function "
+                "that dr.freeze records, but their tree is built on the host. Change "
+                "them "
+                "outside of the frozen function, and give it the integrator as an "
+                "argument.");
+        }
+        throw std::runtime_error(
+            "manylights: dr.freeze cannot record how the light tree of a scene is built, "
+            "because that is done on the host. Before the first call, call mi.render "
+            "outside of the frozen function, with the same scene and integrator and one "
+            "sample per pixel.");
     }
 
     /// If emitters have only become brighter or darker, and nobody uses the lights
@@ -261,23 +282,6 @@ private:
         m_entries[slot] =
             std::make_shared<Entry>(scene, std::move(fingerprint), std::move(lights));
         return m_entries[slot];
-    }
-
-    [[noreturn]] void refuse_recording(const Scene *scene) const {
-        for (const EntryPtr &entry : m_entries)
-            if (entry && entry->scene == scene)
-                throw std::runtime_error(
-                    "manylights: the lights of the scene have changed within the "
-                    "function "
-                    "that dr.freeze records, but their tree is built on the host. Change "
-                    "them outside of the frozen function, and give it the integrator as "
-                    "an "
-                    "argument.");
-        throw std::runtime_error(
-            "manylights: dr.freeze cannot record how the light tree of a scene is built, "
-            "because that is done on the host. Before the first call, call mi.render "
-            "outside of the frozen function, with the same scene and integrator and one "
-            "sample per pixel.");
     }
 
     static std::string describe(const Statistics &s) {

@@ -6,10 +6,13 @@
 
 namespace manylights {
 
-/// All that the lights of a scene, and the way they are sampled, depend on
+/// All that the lights of a scene, and the way they are sampled, depend on. `literals`: see
+/// Fingerprint::literals
 template <typename Float, typename Spectrum>
-Fingerprint<Float> scene_fingerprint(const mitsuba::Scene<Float, Spectrum> *scene) {
-    Fingerprint<Float> result(scene->emitters().size());
+Fingerprint<Float>
+scene_fingerprint(const mitsuba::Scene<Float, Spectrum> *scene,
+                  typename Fingerprint<Float>::Literals literals = {}) {
+    Fingerprint<Float> result(scene->emitters().size(), std::move(literals));
     dr::mask_t<Float> active(true);
     for (const auto &emitter : scene->emitters()) {
         const auto *shape = emitter->shape();
