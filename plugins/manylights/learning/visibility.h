@@ -238,6 +238,7 @@ public:
     bool learn(const UInt32 &nodes, const ParentLink &parent_link) {
         if constexpr (dr::is_jit_v<Float>) {
             Summary all = summarize(dr::arange<UInt32>(m_records), nodes, parent_link);
+            dr::eval(all); // one kernel, and not one for each sum
             Float rays = dr::sum(all.rays), gain = dr::sum(all.gain);
             m_factors = all.word;
             if (is_recorded<Float>()) {
@@ -245,7 +246,7 @@ public:
                 dr::eval(m_factors);
                 return true;
             }
-            dr::eval(m_factors, rays, gain);
+            dr::eval(rays, gain);
             return gain[0] / std::max(rays[0], 1.f) >= kLeastGain;
         } else {
             double rays = 0, gain = 0;
@@ -292,6 +293,7 @@ private:
     struct Summary {
         UInt32 word;
         Float rays, gain;
+        DRJIT_STRUCT(Summary, word, rays, gain)
     };
 
     dr::Array<Float, kCounts> read(const UInt32 &record, const Mask &active) const {

@@ -32,10 +32,10 @@ public:
     /// @param seed  of the rendering: what trains is the same in all of its passes
     PixelSet(uint32_t width, uint32_t height, Role role, const UInt32 &seed)
         : m_width(width), m_height(height), m_columns((width + kSide - 1) / kSide),
-          m_role(role), m_seed(seed) {
-        // One kernel for all seeds
+          m_role(role), m_seed(seed), m_trains(role == Role::Train) {
+        // One kernel for all seeds, and for those that train and the rest
         if (role != Role::All)
-            dr::make_opaque(m_seed);
+            dr::make_opaque(m_seed, m_trains);
     }
 
     /// How many numbers there are
@@ -59,8 +59,8 @@ public:
         auto [block, rest] = divide(number, per_block());
         auto [row, column] = divide(block, m_columns);
         UInt32 place       = trained(column, row);
-        if (m_role == Role::Rest)
-            place = rest + dr::select(rest >= place, UInt32(1), UInt32(0));
+        place    = dr::select(m_trains, place,
+                              rest + dr::select(rest >= place, UInt32(1), UInt32(0)));
         UInt32 x = column * kSide + place % kSide, y = row * kSide + place / kSide;
         return { x, y, x < m_width && y < m_height };
     }
@@ -73,20 +73,19 @@ public:
         UInt32 column = x / kSide, row = y / kSide,
                block = dr::fmadd(row, m_columns, column), out = trained(column, row),
                place = place_in_block(x, y);
-        if (m_role == Role::Train)
-            return { block, inside && place == out };
-        UInt32 rest = place - dr::select(place > out, UInt32(1), UInt32(0));
-        return { dr::fmadd(block, per_block(), rest), inside && place != out };
+        UInt32 rest  = place - dr::select(place > out, UInt32(1), UInt32(0));
+        return { dr::fmadd(block, dr::opaque<UInt32>(per_block()),
+                           dr::select(m_trains, UInt32(0), rest)),
+                 inside && (place == out) == m_trains };
     }
 
     /// Is a pixel within the borders in the set?
     Mask contains(const UInt32 &x, const UInt32 &y) const {
-        return m_role == Role::All ? Mask(true) : is_trained(x, y) == Mask(trains());
+        return m_role == Role::All ? Mask(true) : is_trained(x, y) == m_trains;
     }
 
 private:
-    bool trains() const { return m_role == Role::Train; }
-    uint32_t per_block() const { return trains() ? 1 : kSide * kSide - 1; }
+    uint32_t per_block() const { return m_role == Role::Train ? 1 : kSide * kSide - 1; }
 
     /// Place of the pixel of a block that trains
     UInt32 trained(const UInt32 &column, const UInt32 &row) const {
@@ -105,6 +104,7 @@ private:
     uint32_t m_width, m_height, m_columns;
     Role m_role;
     UInt32 m_seed;
+    Mask m_trains;
 };
 
 } // namespace manylights
