@@ -196,8 +196,14 @@ first of them. As in Mitsuba's integrators, light sampling never chooses an emit
 :code:`sampling_weight` is 0, so that it is dark if rays cannot hit it; other weights do not matter
 here. The unit of emission does not matter either.
 
-.. note:: This integrator does not handle participating media or indirect illumination. In JIT
-   variants it refuses to be recorded by :code:`dr.freeze`.
+Functions that :code:`dr.freeze` records give the images of functions that are not recorded, with
+lamps and cameras that change between their calls. The light tree and the lamps that are small on
+the film are brought up to date before each call, on the host: render each scene once with this
+integrator and the same sensor outside of the function, and change lights and cameras outside of it.
+With :code:`learn_visibility` it cannot be recorded if the value is :code:`keep`, with
+:code:`light_groups` or with a :code:`plan`. The errors say so.
+
+.. note:: This integrator does not handle participating media or indirect illumination.
 
 .. tabs::
     .. code-tab::  xml

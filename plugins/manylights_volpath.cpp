@@ -143,9 +143,9 @@ densities: no weight exceeds the number of channels.
   :monosp:`manylights_direct`.
 
 .. note:: Gradients of BSDFs, media and emitters flow through :code:`mi.render` in the
-   :code:`ad` variants; positions of lights are not differentiated. In JIT variants this
-   integrator refuses to be recorded by :code:`dr.freeze`. Light sampling never chooses an
-   emitter whose :code:`sampling_weight` is 0; other weights do not matter.
+   :code:`ad` variants; positions of lights are not differentiated. Functions that
+   render can be recorded by :code:`dr.freeze`, see :monosp:`manylights_direct`. Light sampling
+   never chooses an emitter whose :code:`sampling_weight` is 0; other weights do not matter.
 
 .. tabs::
     .. code-tab::  xml

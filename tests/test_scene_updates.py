@@ -589,37 +589,6 @@ def test_large_tree_under_nesting():
     assert process.stdout.split()[-1:] == ["done"], process.stderr
 
 
-# ----------------------------------------------------------------------------------------- freezing
-
-
-@pytest.mark.parametrize("seen", [False, True], ids=["new scene", "scene rendered before"])
-def test_freezing_is_refused(llvm, seen):
-    """The message says what cannot be done and what to do instead."""
-    scene, integrator = load("intensity"), light_tree()
-    if seen:
-        image(scene, integrator)
-
-    @dr.freeze
-    def frozen():
-        return mi.render(scene, integrator=integrator, spp=1)
-
-    with pytest.raises(RuntimeError) as raised:
-        frozen()
-    text = full_text(raised.value)
-    assert "dr.freeze" in text
-    assert "mi.render outside of the frozen function" in text
-    assert_current(scene, integrator)
-
-
-def full_text(error):
-    """The messages of an exception and of its causes."""
-    texts = []
-    while error is not None:
-        texts.append(str(error))
-        error = error.__cause__ or error.__context__
-    return "\n".join(texts)
-
-
 # ------------------------------------------------------------------------------ published numbers
 
 KEYS = ("lights", "lights_in_tree", "nodes", "depth", "bytes", "build_ms")

@@ -151,13 +151,26 @@ def test_same_seed_same_bits(variant, kind, thread_count):
 
 
 @pytest.mark.parametrize("kind", INTEGRATORS)
-def test_all_seeds_take_the_same_kernels(llvm, kind):
-    """The seed says which pixels train: as a number, and not as a part of the kernels."""
-    scene, method = mi.load_dict(hidden_points()), integrator(kind)
+@pytest.mark.parametrize("learns", [True, False], ids=["learns", "one pass"])
+@pytest.mark.parametrize(
+    "sampler",
+    ["independent", "stratified", "multijitter", "orthogonal", "ldsampler", "manylights_sobol"],
+)
+def test_all_seeds_take_the_same_kernels(llvm, kind, learns, sampler):
+    """The seed says which pixels train, and which points of lamps in sight are sampled: as a
+    number, and not as a part of the kernels."""
+    scene = hidden_points()
+    scene["sensor"]["sampler"] = {"type": sampler, "sample_count": 4}
+    for i in range(4):
+        scene[f"small_{i}"] = {
+            **{"type": "sphere", "center": [i - 2.0, 1.0, 2.5], "radius": 0.01},
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1e3}},
+        }
+    scene, method = mi.load_dict(scene), integrator(kind, learn_visibility=learns)
 
     def kernels(seed):
         dr.kernel_history_clear()
-        render(scene, method, seed)
+        render(scene, method, seed, spp=25 if sampler == "orthogonal" else 16)
         return {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):

@@ -275,9 +275,8 @@ private:
 
     /// Can a path that may not scatter any more go straight on through a surface?
     Mask can_pass(const BSDFPtr &bsdf, Mask surface) const {
-        if (!m_media)
-            return false;
-        return surface && has_flag(bsdf->flags(), mitsuba::BSDFFlags::Null);
+        return m_media ? surface && has_flag(bsdf->flags(), mitsuba::BSDFFlags::Null)
+                       : Mask(false);
     }
 
     /// Emitters that the camera does not see may still be borders of media
@@ -298,19 +297,15 @@ private:
     }
 
     void intersect(State &s, bool coherent) const {
-        // As `path` does it: GPUs sort scattered rays by the shapes that they meet
-        bool reorder = !coherent && jit_flag(JitFlag::SymbolicLoops);
-        s.pi = m_scene->ray_intersect_preliminary(s.ray, coherent, reorder,
-                                                  /* reorder_hint = */ 0u,
-                                                  /* reorder_hint_bits = */ 0, s.active);
+        // GPUs sort scattered rays by the shapes that they meet, as `path` has it
+        bool sort = !coherent && jit_flag(JitFlag::SymbolicLoops);
+        s.pi = m_scene->ray_intersect_preliminary(s.ray, coherent, sort, 0, 0, s.active);
         if (m_limits.hide_emitters && coherent && !m_media)
             skip_emitters(m_scene, s.ray, s.pi, s.active);
     }
 
     BSDFPtr bsdf_of(const SurfaceInteraction3f &si, Mask active) const {
-        if (dr::none_or<false>(active))
-            return nullptr;
-        return si.bsdf();
+        return dr::none_or<false>(active) ? BSDFPtr(nullptr) : si.bsdf();
     }
 
     const Scene *m_scene;

@@ -7,7 +7,6 @@
 
 #include "film_channels.h"
 #include <atomic>
-#include <cmath>
 #include <drjit/jit.h>
 #include <mitsuba/render/film.h>
 #include <mitsuba/render/imageblock.h>
@@ -26,7 +25,8 @@ public:
      * @param channels  what the film has beside colours
      * @param groups    of lights that have layers
      */
-    FixedPointSums(Film *film, double most, const FilmChannels &channels, uint32_t groups)
+    FixedPointSums(Film *film, const Float &most, const FilmChannels &channels,
+                   uint32_t groups)
         : m_film(film), m_size(film->crop_size()), m_filter(film->rfilter()),
           m_box(m_filter->is_box_filter()), m_reach(m_box ? 0 : m_filter->border_size()) {
         size_t others = own_channels(film);
@@ -36,11 +36,12 @@ public:
         m_first_group = (uint32_t) m_channels.size();
         for (uint32_t group = 0; group < groups; ++group)
             add_channels(others + channels.groups + 3 * group);
-        m_sums     = make(m_channels.size() * dr::prod(m_size));
-        int digits = 62 - 14 - std::ilogb(most) - 1;
-        digits     = std::clamp(digits, -100, 100);
-        m_unit     = dr::opaque<Float>(std::ldexp(1.f, -digits));
-        m_scale    = dr::opaque<Float>(std::ldexp(1.f, digits));
+        m_sums = make(m_channels.size() * dr::prod(m_size));
+        // A power of two, from the exponent of `most`
+        Int32 exponent = Int32(dr::reinterpret_array<UInt32>(most) >> 23u) - 127,
+              digits   = dr::clip(62 - 14 - 1 - exponent, -100, 100);
+        m_unit         = power_of_two(-digits);
+        m_scale        = power_of_two(digits);
     }
 
     /// What a point of a lamp adds: to the image, to its own emission in sight, and to its group
@@ -103,6 +104,10 @@ private:
             return dr::zeros<UInt64>(size);
         else
             return Sums(size);
+    }
+
+    static Float power_of_two(const Int32 &exponent) {
+        return dr::reinterpret_array<Float>(UInt32(exponent + 127) << 23u);
     }
 
     /// As samples of cameras get it

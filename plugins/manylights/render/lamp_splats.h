@@ -11,7 +11,7 @@
 #include "manylights/base/divide.h"
 #include "manylights/base/random.h"
 #include "manylights/sampler/sobol.h"
-#include "manylights/scene/lamps_in_view.h"
+#include "manylights/scene/lamp_views.h"
 #include "manylights/scene/media.h"
 #include "manylights/scene/scene_emission.h"
 #include "passes.h"
@@ -51,7 +51,7 @@ public:
                                              UInt32D(pass.plan.scramble), 8)
                           .first;
         dr::make_opaque(key);
-        Sums sums(m_film, m_lamps.most(pass.plan.count), m_channels,
+        Sums sums(m_film, Float(m_lamps.most(pass.plan.count)), m_channels,
                   m_lights.groups().count());
         uint32_t points = m_lamps.points(), most = std::max(kMostLanes / points, 1u);
         for (uint32_t done = 0; done < pass.plan.count; done += most) {
@@ -242,17 +242,25 @@ public:
     using Lamps  = typename Splats::Lamps;
     using Lights = typename Splats::Lights;
 
+    using Views = LampViews<Float, Spectrum>;
+
     /**
      * @param known  where camera rays find them
+     * @param views  those of functions that are recorded
      * @param shown  can there be any?
      * The others are those of \ref LampSplats.
      */
-    LampPasses(std::unique_ptr<Lamps> &known, const Lights &lights, const Scene *scene,
-               Sensor *sensor, bool shown, const MediaKinds &media,
+    LampPasses(std::shared_ptr<Lamps> &known, Views &views, const Lights &lights,
+               const Scene *scene, Sensor *sensor, bool shown, const MediaKinds &media,
                const FilmChannels &channels)
         : m_known(known) {
-        if (shown)
-            m_known = Lamps::find(lights, sensor, film_size(sensor->film()));
+        auto size = film_size(sensor->film());
+        if (shown && is_recorded<Float>()) {
+            m_known = views.find(scene, sensor, lights, size);
+        } else if (shown) {
+            m_known = Lamps::find(lights, sensor, size);
+            views.remember(scene, sensor);
+        }
         if (m_known)
             m_splats = std::make_unique<Splats>(scene, lights, *m_known, media, sensor,
                                                 channels);
@@ -266,7 +274,7 @@ public:
     }
 
 private:
-    std::unique_ptr<Lamps> &m_known;
+    std::shared_ptr<Lamps> &m_known;
     std::unique_ptr<Splats> m_splats;
 };
 

@@ -18,6 +18,14 @@
 
 namespace manylights {
 
+/// True for a while
+struct Flag {
+    bool &flag;
+    explicit Flag(bool &flag) : flag(flag) { flag = true; }
+    ~Flag() { flag = false; }
+    Flag(const Flag &) = delete;
+};
+
 template <typename Float, typename Spectrum,
           template <typename, typename> typename BaseIntegrator>
 class LightIntegrator : public BaseIntegrator<Float, Spectrum> {
@@ -112,7 +120,7 @@ public:
             if (!is_recorded<Float>())
                 prepare_recording();
             Base::traverse_1_cb_ro(payload, fn);
-            DRJIT_MAP(DR_TRAVERSE_MEMBER_RO, m_facts, m_cache, m_learning,
+            DRJIT_MAP(DR_TRAVERSE_MEMBER_RO, m_facts, m_cache, m_views, m_learning,
                       m_shape_numbers)
         }
     }
@@ -121,7 +129,7 @@ public:
             if (!jit_flag(JitFlag::EnableObjectTraversal))
                 return;
             Base::traverse_1_cb_rw(payload, fn);
-            DRJIT_MAP(DR_TRAVERSE_MEMBER_RW, m_facts, m_cache, m_learning,
+            DRJIT_MAP(DR_TRAVERSE_MEMBER_RW, m_facts, m_cache, m_views, m_learning,
                       m_shape_numbers)
         }
     }
@@ -183,7 +191,7 @@ protected:
     Cache m_cache;
     FilmChannels m_channels;
     /// Of the rendering, those that it samples, too; null if there are none
-    std::unique_ptr<Lamps> m_lamps;
+    std::shared_ptr<Lamps> m_lamps;
 
 private:
     using Renderer = std::conditional_t<dr::is_jit_v<Float>,
@@ -193,14 +201,19 @@ private:
 
     /// Before a function is recorded or replayed
     void prepare_recording() const {
+        std::unique_lock<std::recursive_mutex> lock(m_mutex, std::try_to_lock);
+        if (!lock)
+            throw std::runtime_error("manylights: the integrator of a function that "
+                                     "dr.freeze records renders in another thread.");
         TraversalUnlock unlock;
         Hash facts;
         facts.mix(m_cache.prepare_recording());
         facts.mix(m_learning.is_written());
-        for (const PlannedPass &pass : m_plan)
-            for (uint32_t number :
-                 { pass.first, pass.count, (uint32_t) pass.role, pass.scramble })
-                facts.mix(number);
+        for (uint32_t number : m_plan.numbers())
+            facts.mix(number);
+        m_views.prepare([&](const Scene *scene) { return m_cache.find(scene); },
+                        [](const Sensor *sensor) { return film_size(sensor->film()); },
+                        facts);
         m_facts.set(facts.value);
     }
 
@@ -220,14 +233,6 @@ private:
         return std::unique_lock<std::recursive_mutex>(m_mutex);
     }
 
-    /// True for a while
-    struct Flag {
-        bool &flag;
-        explicit Flag(bool &flag) : flag(flag) { flag = true; }
-        ~Flag() { flag = false; }
-        Flag(const Flag &) = delete;
-    };
-
     /// Follow the plan that was written; none ends a job
     void set_plan() {
         HostView numbers(m_plan_numbers);
@@ -238,25 +243,6 @@ private:
             return;
         m_learning.forget();
         m_cache.forget_visibility();
-    }
-
-    /// Does a parameter of the sensor have one entry for each sample of a rendering? All
-    /// samples are then rendered at once.
-    static bool has_entry_for_each_sample(const Sensor *sensor) {
-        struct Visitor : mitsuba::TraversalCallback {
-            size_t entries = 1;
-            void put_value(std::string_view, void *value, uint32_t,
-                           const std::type_info &type) override {
-                if (type == typeid(Float))
-                    entries = std::max(entries, dr::width(*(const Float *) value));
-            }
-            void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
-        } visitor;
-        if constexpr (dr::is_jit_v<Float>) {
-            visitor.entries = dr::width(sensor->world_transform().matrix);
-            const_cast<Sensor *>(sensor)->traverse(&visitor);
-        }
-        return visitor.entries > 1;
     }
 
     TensorXf render_passes(Lights &lights, Scene *scene, Sensor *sensor,
@@ -280,12 +266,11 @@ private:
         log_start(size, spp, plan.size());
         typename Learning::Session session(m_learning);
         m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
-        // Chosen on the host: in functions that are recorded camera rays alone find lamps
-        bool shows_lamps = shows_emitters() && !is_recorded<Float>() &&
-                           !has_flag(film->flags(), mitsuba::FilmFlags::Special);
-        LampPasses<Float, Spectrum> lamps(m_lamps, lights, scene, sensor, shows_lamps,
-                                          media(lights, scene, sensor->medium()),
-                                          m_channels);
+        bool shows_lamps =
+            shows_emitters() && !has_flag(film->flags(), mitsuba::FilmFlags::Special);
+        LampPasses<Float, Spectrum> lamps(
+            m_lamps, m_views, lights, scene, sensor, shows_lamps,
+            media(lights, scene, sensor->medium()), m_channels);
         Renderer renderer(*this, scene, sensor, channels, m_block_size);
         for (size_t i = 0; i < plan.size() && !should_stop(); ++i) {
             m_learning.start_pass(plan[i]);
@@ -303,14 +288,8 @@ private:
 
     void log_start(const mitsuba::Vector<uint32_t, 2> &size, uint32_t spp,
                    size_t passes) const {
-        std::string details =
-            passes > 1 ? tfm::format(", %zu passes", passes) : std::string();
-        if constexpr (!dr::is_jit_v<Float>) {
-            size_t threads = pool_size() + 1;
-            details += tfm::format(", %zu thread%s", threads, threads == 1 ? "" : "s");
-        }
-        Log(mitsuba::Info, "Starting render job (%ux%u, %u sample%s%s)", size.x(),
-            size.y(), spp, spp == 1 ? "" : "s", details);
+        Log(mitsuba::Info, "Starting render job (%s)",
+            describe_job(size, spp, passes, dr::is_jit_v<Float> ? 0 : pool_size() + 1));
         if (m_timeout > 0.f)
             Log(mitsuba::Info, "Timeout specified: %.2f seconds.", m_timeout);
     }
@@ -337,13 +316,14 @@ private:
 
     static constexpr const char *ClassName = "LightIntegrator"; // for log messages
 
-    std::recursive_mutex m_mutex;
+    mutable std::recursive_mutex m_mutex;
     bool m_rendering = false, m_differentiating = false;
     /// What users have written, four numbers for each pass, and what it says
     mitsuba::DynamicBuffer<UInt32> m_plan_numbers;
     PassPlan m_plan;
     Learning m_learning;
     ShapeNumbers<Float, Spectrum> m_shape_numbers;
+    mutable LampViews<Float, Spectrum> m_views;
     mutable HostFacts<dr::uint32_array_t<dr::detached_t<Float>>> m_facts;
 };
 

@@ -96,6 +96,15 @@ public:
                     std::to_string(spp - 1));
     }
 
+    /// As users write them
+    std::vector<uint32_t> numbers() const {
+        std::vector<uint32_t> result;
+        for (const PlannedPass &pass : m_passes)
+            result.insert(result.end(), { pass.first, pass.count, (uint32_t) pass.role,
+                                          pass.scramble });
+        return result;
+    }
+
     bool empty() const { return m_passes.empty(); }
     size_t size() const { return m_passes.size(); }
     const PlannedPass &operator[](size_t i) const { return m_passes[i]; }

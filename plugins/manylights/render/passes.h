@@ -12,6 +12,8 @@
 #include <mitsuba/core/vector.h>
 #include <mitsuba/render/film.h>
 #include <mitsuba/render/sampler.h>
+#include <mitsuba/render/sensor.h>
+#include <string>
 #include <string_view>
 
 namespace manylights {
@@ -24,6 +26,39 @@ template <typename Film> mitsuba::Vector<uint32_t, 2> film_size(const Film *film
     if (film->sample_border())
         size += 2 * film->rfilter()->border_size();
     return size;
+}
+
+/// Does a parameter of the sensor have one entry for each sample of a rendering? All
+/// samples are then rendered at once.
+template <typename Float, typename Spectrum>
+bool has_entry_for_each_sample(const mitsuba::Sensor<Float, Spectrum> *sensor) {
+    struct Visitor : mitsuba::TraversalCallback {
+        size_t entries = 1;
+        void put_value(std::string_view, void *value, uint32_t,
+                       const std::type_info &type) override {
+            if (type == typeid(Float))
+                entries = std::max(entries, dr::width(*(const Float *) value));
+        }
+        void put_object(std::string_view, mitsuba::Object *, uint32_t) override {}
+    } visitor;
+    if constexpr (dr::is_jit_v<Float>) {
+        visitor.entries = dr::width(sensor->world_transform().matrix);
+        const_cast<mitsuba::Sensor<Float, Spectrum> *>(sensor)->traverse(&visitor);
+    }
+    return visitor.entries > 1;
+}
+
+/// A rendering in words; no threads: those of Dr.Jit
+inline std::string describe_job(const mitsuba::Vector<uint32_t, 2> &size, uint32_t spp,
+                                size_t passes, size_t threads) {
+    auto count = [](size_t number, const char *noun) {
+        return std::to_string(number) + " " + noun + (number == 1 ? "" : "s");
+    };
+    std::string result = std::to_string(size.x()) + "x" + std::to_string(size.y()) +
+                         ", " + count(spp, "sample");
+    if (passes > 1)
+        result += ", " + std::to_string(passes) + " passes";
+    return threads > 0 ? result + ", " + count(threads, "thread") : result;
 }
 
 /// How a sampler's numbers belong together

@@ -152,10 +152,12 @@ private:
             seed = mitsuba::sample_tea_32(seed, UInt32(first), 6).first;
         // A pattern depends on the number of a pixel's first lane: to be that of all samples
         bool whole = samples == m_sampler->sample_count() && pass.plan.role == Role::All;
-        if (pass.sampler.pattern && whole)
+        if (pass.sampler.pattern && whole) {
             seed += first * samples;
-        else if (pass.sampler.pattern)
+        } else if (pass.sampler.pattern) {
+            dr::make_opaque(seed); // one kernel for all seeds
             seed += pixel * m_sampler->sample_count() - number * samples;
+        }
         m_sampler->seed(seed, lanes);
     }
 

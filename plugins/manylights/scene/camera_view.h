@@ -6,6 +6,7 @@
  */
 
 #include "manylights/base/parameter_reader.h"
+#include "manylights/base/recording.h"
 #include "manylights/emission/emission_reader.h"
 #include <mitsuba/core/vector.h>
 #include <mitsuba/core/warp.h>
@@ -90,6 +91,19 @@ template <typename Float> struct CameraView {
         result.lens          = lens;
         return result;
     }
+
+    /// For host variables
+    bool operator==(const CameraView &other) const {
+        bool same = lens == other.lens && radius == other.radius &&
+                    inverse_focus == other.inverse_focus &&
+                    near_clip == other.near_clip && far_clip == other.far_clip &&
+                    dr::all(position == other.position && axes[0] == other.axes[0] &&
+                            axes[1] == other.axes[1] && axes[2] == other.axes[2]);
+        return same && dr::all(scale == other.scale && shift == other.shift);
+    }
+
+    MANYLIGHTS_TRAVERSE(position, axes, scale, shift, radius, inverse_focus, near_clip,
+                        far_clip)
 
     bool lens = false;
 };

@@ -141,25 +141,43 @@ public:
     };
 
     /// Null if no lamp is worth it
-    static std::unique_ptr<LampsInView> find(const Lights &lights, const Sensor *sensor,
+    static std::shared_ptr<LampsInView> find(const Lights &lights, const Sensor *sensor,
                                              const mitsuba::Vector<uint32_t, 2> &size) {
-        if (!lights.can_be_hit() || lights.tree().light_count == 0 || !has_view(sensor))
+        if (!may_find(lights, sensor))
             return {};
-        std::unique_ptr<LampsInView> result(new LampsInView(lights));
-        CameraView<float> camera = read_view(sensor);
+        return find(lights, sensor, size, read_view(sensor));
+    }
+    static std::shared_ptr<LampsInView> find(const Lights &lights, const Sensor *sensor,
+                                             const mitsuba::Vector<uint32_t, 2> &size,
+                                             const CameraView<float> &camera) {
+        std::shared_ptr<LampsInView> result(new LampsInView(lights));
         if (!result->choose(camera, sensor->film(), size))
             return {};
         result->m_camera = camera.template opaque<FloatD>();
         return result;
     }
 
+    /// Is there any lamp, and a camera with a view?
+    static bool may_find(const Lights &lights, const Sensor *sensor) {
+        return lights.can_be_hit() && lights.tree().light_count > 0 && has_view(sensor);
+    }
+
+    MANYLIGHTS_TRAVERSE(m_camera, m_rates, m_chosen, m_ends, m_count, m_sum, m_mean_sum)
+
     const Camera &camera() const { return m_camera; }
     /// Numbers of points to choose for each sample of the pixels, see \ref at
     uint32_t points() const { return m_points; }
+    /// A few more numbers of points, that have no lamp: the same for views that differ little
+    void round_points() {
+        uint32_t points = 1;
+        while (points < m_points)
+            points *= 2;
+        m_points = points;
+    }
     /// No pixel has more light after so many samples, in units of brightness
-    double most(uint32_t samples) const {
-        constexpr double uneven = 34; // of a number of points, at most
-        return m_mean_sum * samples + m_sum * uneven;
+    FloatD most(uint32_t samples) const {
+        constexpr float uneven = 34; // of a number of points, at most
+        return m_mean_sum * (float) samples + m_sum * uneven;
     }
 
     /// The lamp of a point: `number` counts those of one sample, `start` is where they begin,
@@ -170,7 +188,7 @@ public:
             UInt32D low, high;
             DRJIT_STRUCT(State, low, high)
         };
-        State state{ UInt32D(0), dr::opaque<UInt32D>(m_count) };
+        State state{ UInt32D(0), m_count };
         loop(
             state, [](const State &s) { return s.low < s.high; },
             [&](State &s) {
@@ -180,7 +198,7 @@ public:
                 s.high         = dr::select(below, s.high, middle);
             },
             "Lamps: choice");
-        MaskD active  = state.low < dr::opaque<UInt32D>(m_count);
+        MaskD active  = state.low < m_count;
         UInt32D light = dr::gather<UInt32D>(m_chosen, state.low, active);
         return { light, dr::gather<FloatD>(m_rates, light, active), active };
     }
@@ -237,6 +255,7 @@ private:
         HostVector<float> rates(count);
         std::fill(rates.begin(), rates.end(), 0.f);
         uint64_t end = 0;
+        double sum = 0, mean_sum = 0;
         std::vector<uint32_t> chosen;
         std::vector<uint64_t> ends;
         for (uint32_t i : lamps.small()) {
@@ -247,16 +266,19 @@ private:
                 continue;
             chosen.push_back(i);
             ends.push_back(end += points);
-            m_sum += row[i].brightness;
-            m_mean_sum += (double) rates[i] * row[i].brightness;
+            sum += row[i].brightness;
+            mean_sum += (double) rates[i] * row[i].brightness;
         }
-        m_count  = (uint32_t) chosen.size();
-        m_points = (uint32_t) ((end + 0xffffffffu) >> 32);
-        if (m_count == 0)
+        if (chosen.empty())
             return false;
-        m_rates  = dr::load<mitsuba::DynamicBuffer<FloatD>>(rates.data(), count);
-        m_chosen = dr::load<mitsuba::DynamicBuffer<UInt32D>>(chosen.data(), m_count);
-        m_ends   = dr::load<mitsuba::DynamicBuffer<UInt64D>>(ends.data(), m_count);
+        m_points   = (uint32_t) ((end + 0xffffffffu) >> 32);
+        m_count    = dr::opaque<UInt32D>((uint32_t) chosen.size());
+        m_sum      = dr::opaque<FloatD>((float) sum);
+        m_mean_sum = dr::opaque<FloatD>((float) mean_sum);
+        m_rates    = dr::load<mitsuba::DynamicBuffer<FloatD>>(rates.data(), count);
+        m_chosen =
+            dr::load<mitsuba::DynamicBuffer<UInt32D>>(chosen.data(), chosen.size());
+        m_ends = dr::load<mitsuba::DynamicBuffer<UInt64D>>(ends.data(), ends.size());
         return true;
     }
 
@@ -267,9 +289,10 @@ private:
     /// Lights that have any, and where each one's points end, as fractions of 32 digits
     mitsuba::DynamicBuffer<UInt32D> m_chosen;
     mitsuba::DynamicBuffer<UInt64D> m_ends;
-    uint32_t m_count = 0, m_points = 0;
+    UInt32D m_count   = 0;
+    uint32_t m_points = 0;
     /// Brightness of all of them, and of the points of one sample
-    double m_sum = 0, m_mean_sum = 0;
+    FloatD m_sum = 0.f, m_mean_sum = 0.f;
 };
 
 /// A value and its weight; its derivative is that without the other samples

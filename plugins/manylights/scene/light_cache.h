@@ -17,6 +17,7 @@
  */
 
 #include "manylights/choice/parameters.h"
+#include "scene_arrays.h"
 #include "scene_fingerprint.h"
 #include "scene_lights.h"
 #include <atomic>
@@ -34,7 +35,7 @@ namespace manylights {
 template <typename Float, typename Spectrum> class LightCache {
 public:
     using Lights = SceneLights<Float, Spectrum>;
-    MI_IMPORT_TYPES(Scene, Sampler, EmitterPtr, ShapePtr)
+    MI_IMPORT_TYPES(Scene, Sampler)
 
     explicit LightCache(const SamplingParameters &params) : m_params(params) {}
 
@@ -42,9 +43,7 @@ private:
     /// The lights of a scene as it was; those who use them keep it
     struct Entry {
         const Scene *scene;
-        /// The arrays of a scene that lives belong to it, too, and tell it from others
-        mitsuba::DynamicBuffer<EmitterPtr> emitters;
-        mitsuba::DynamicBuffer<ShapePtr> shapes;
+        std::shared_ptr<SceneArrays<Float, Spectrum>> arrays;
         Fingerprint<Float> fingerprint;
         mitsuba::ref<Lights> lights;
         /// How many calls of `render()` have checked these lights and go on
@@ -52,18 +51,10 @@ private:
 
         Entry(const Scene *scene, Fingerprint<Float> &&fingerprint,
               mitsuba::ref<Lights> lights)
-            : scene(scene), emitters(scene->emitters_dr()), shapes(scene->shapes_dr()),
+            : scene(scene), arrays(SceneArrays<Float, Spectrum>::of(scene)),
               fingerprint(std::move(fingerprint)), lights(lights) {}
 
-        bool has_scene() const {
-            if constexpr (dr::is_jit_v<Float>)
-                return (!emitters.index() || jit_var_ref(emitters.index()) > 1) &&
-                       (!shapes.index() || jit_var_ref(shapes.index()) > 1);
-            else
-                return true;
-        }
-
-        MANYLIGHTS_TRAVERSE(emitters, shapes, lights)
+        MANYLIGHTS_TRAVERSE(arrays, lights)
     };
     using EntryPtr = std::shared_ptr<Entry>;
 
@@ -135,7 +126,7 @@ public:
         const Scene *current = m_current ? m_current->scene : nullptr;
         Hash facts;
         for (EntryPtr &entry : m_entries) {
-            if (entry && !entry->has_scene())
+            if (entry && !entry->arrays->has_scene())
                 entry.reset();
             if (entry && entry->renderings == 0)
                 update(entry->scene);
@@ -147,6 +138,15 @@ public:
             if (entry && entry->scene == current)
                 m_current = entry;
         return facts.value;
+    }
+
+    /// The lights of a scene as they are, null if it is not known or gone
+    mitsuba::ref<Lights> find(const Scene *scene) const {
+        std::lock_guard<std::mutex> guard(m_mutex);
+        for (const EntryPtr &entry : m_entries)
+            if (entry && entry->scene == scene)
+                return entry->lights;
+        return nullptr;
     }
 
     /// What dr.freeze has to know

@@ -6,12 +6,12 @@
  */
 
 #include "light_groups.h"
+#include "manylights/base/stopwatch.h"
 #include "manylights/choice/parameters.h"
 #include "media_kinds.h"
 #include "refit.h"
 #include "scene_lobes.h"
 #include "visibility_learner.h"
-#include <chrono>
 #include <cmath>
 #include <unordered_map>
 
@@ -113,8 +113,12 @@ public:
             return false;
         m_needs_emitter_eval |= refit.needs_emitter_eval();
         m_statistics.refit_ms = stopwatch.milliseconds();
+        ++m_version;
         return true;
     }
+
+    /// How often they have changed
+    uint32_t version() const { return m_version; }
 
     /// For integrators that trace no rays from surfaces to find lights with
     void warn_of_lights_for_rays() const {
@@ -233,17 +237,6 @@ private:
         return Directions::All;
     }
 
-    class Stopwatch {
-    public:
-        float milliseconds() const {
-            auto time = std::chrono::steady_clock::now() - m_start;
-            return std::chrono::duration<float, std::milli>(time).count();
-        }
-
-    private:
-        std::chrono::steady_clock::time_point m_start = std::chrono::steady_clock::now();
-    };
-
     /// Never empty: kernels may refer to it with all lanes inactive
     static Storage or_empty(const Storage &array) {
         return dr::width(array) ? array
@@ -320,6 +313,7 @@ private:
     /// Of the scene's bounding box
     FloatD m_diagonal     = 0.f;
     float m_host_diagonal = 0.f;
+    uint32_t m_version    = 0;
     Statistics m_statistics;
 };
 
