@@ -150,13 +150,17 @@ def test_same_seed_same_bits(variant, kind, thread_count):
     assert np.array_equal(expected, render(scene, integrator(kind)))
 
 
-@pytest.mark.parametrize("kind", INTEGRATORS)
-@pytest.mark.parametrize("learns", [True, False], ids=["learns", "one pass"])
+SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+
+
 @pytest.mark.parametrize(
-    "sampler",
-    ["independent", "stratified", "multijitter", "orthogonal", "ldsampler", "manylights_sobol"],
+    ("kind", "sampler", "learns"),
+    [
+        *[("direct", sampler, True) for sampler in (*SAMPLERS, "manylights_sobol")],
+        *[("paths", "multijitter", True), ("direct", "multijitter", False)],
+    ],
 )
-def test_all_seeds_take_the_same_kernels(llvm, kind, learns, sampler):
+def test_all_seeds_take_the_same_kernels(llvm, kind, sampler, learns):
     """The seed says which pixels train, and which points of lamps in sight are sampled: as a
     number, and not as a part of the kernels."""
     scene = hidden_points()

@@ -250,7 +250,7 @@ public:
      * @param shown  can there be any?
      * The others are those of \ref LampSplats.
      */
-    LampPasses(std::shared_ptr<Lamps> &known, Views &views, const Lights &lights,
+    LampPasses(std::shared_ptr<Lamps> &known, const Views &views, const Lights &lights,
                const Scene *scene, Sensor *sensor, bool shown, const MediaKinds &media,
                const FilmChannels &channels)
         : m_known(known) {
@@ -259,7 +259,6 @@ public:
             m_known = views.find(scene, sensor, lights, size);
         } else if (shown) {
             m_known = Lamps::find(lights, sensor, size);
-            views.remember(scene, sensor);
         }
         if (m_known)
             m_splats = std::make_unique<Splats>(scene, lights, *m_known, media, sensor,

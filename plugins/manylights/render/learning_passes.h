@@ -48,8 +48,8 @@ public:
         m_continues = false;
     }
 
-    /// Are the counts those that were written?
-    bool is_written() const { return m_frozen; }
+    /// How many counts were written
+    size_t written() const { return m_frozen ? dr::width(m_counts) : 0; }
 
     /// The next rendering knows nothing of those before
     void forget() {

@@ -203,17 +203,15 @@ private:
     void prepare_recording() const {
         std::unique_lock<std::recursive_mutex> lock(m_mutex, std::try_to_lock);
         if (!lock)
-            throw std::runtime_error("manylights: the integrator of a function that "
-                                     "dr.freeze records renders in another thread.");
+            throw std::runtime_error("manylights: dr.freeze looks at an integrator that "
+                                     "renders in another thread.");
         TraversalUnlock unlock;
         Hash facts;
         facts.mix(m_cache.prepare_recording());
-        facts.mix(m_learning.is_written());
+        facts.mix(m_learning.written());
         for (uint32_t number : m_plan.numbers())
             facts.mix(number);
-        m_views.prepare([&](const Scene *scene) { return m_cache.find(scene); },
-                        [](const Sensor *sensor) { return film_size(sensor->film()); },
-                        facts);
+        m_views.prepare(m_cache, film_size<Film>, facts);
         m_facts.set(facts.value);
     }
 
@@ -266,6 +264,8 @@ private:
         log_start(size, spp, plan.size());
         typename Learning::Session session(m_learning);
         m_learning.start(lights, scene, sensor, plan, (double) pixels * spp, job);
+        if (!is_recorded<Float>())
+            m_views.remember(scene, sensor, m_cache);
         bool shows_lamps =
             shows_emitters() && !has_flag(film->flags(), mitsuba::FilmFlags::Special);
         LampPasses<Float, Spectrum> lamps(

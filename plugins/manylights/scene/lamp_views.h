@@ -6,6 +6,8 @@
  */
 
 #include "lamps_in_view.h"
+#include <algorithm>
+#include <mitsuba/render/sampler.h>
 #include <stdexcept>
 
 namespace manylights {
@@ -17,35 +19,49 @@ public:
     using Lights = typename Lamps::Lights;
     using Size   = mitsuba::Vector<uint32_t, 2>;
 
-    /// Those of a view from now on, of all that are remembered the last ones
-    void remember(const Scene *scene, Sensor *sensor) {
+    /**
+     * Those of a view from now on.
+     * @param cache  tells the lights of a scene, null if that is not known any more
+     */
+    template <typename Cache>
+    void remember(const Scene *scene, Sensor *sensor, const Cache &cache) {
         if constexpr (dr::is_jit_v<Float>) {
+            const auto &own = scene->sensors();
+            bool foreign = std::none_of(own.begin(), own.end(),
+                                        [&](const auto &each) { return each == sensor; });
+            auto replaced = [&](const View &view) {
+                bool same = view.scene == scene && view.sensor == sensor;
+                return !same && ((foreign && view.kept) || !cache.find(view.scene));
+            };
+            m_views.erase(std::remove_if(m_views.begin(), m_views.end(), replaced),
+                          m_views.end());
             for (const View &view : m_views)
                 if (view.scene == scene && view.sensor == sensor)
                     return;
-            if (m_views.size() == kMost)
-                m_views.erase(m_views.begin());
             m_views.emplace_back();
             m_views.back().scene  = scene;
             m_views.back().sensor = sensor;
+            if (foreign)
+                m_views.back().kept = sensor;
         }
     }
 
     /**
      * Follow all changes. Adds what is no array, see HostFacts.
-     * @param lights_of  those of a scene, null if that is gone
-     * @param size_of    how many pixels of a sensor are rendered
+     * @param cache      see above; it knows no scene that is gone
+     * @param film_size  how many pixels of a film are rendered
      */
-    template <typename LightsOf, typename SizeOf>
-    void prepare(const LightsOf &lights_of, const SizeOf &size_of, Hash &facts) {
+    template <typename Cache, typename FilmSize>
+    void prepare(const Cache &cache, const FilmSize &film_size, Hash &facts) {
         for (size_t i = 0; i < m_views.size();) {
-            mitsuba::ref<Lights> lights = lights_of(m_views[i].scene);
+            mitsuba::ref<Lights> lights = cache.find(m_views[i].scene);
             if (!lights) {
                 m_views.erase(m_views.begin() + i);
                 continue;
             }
             View &view = m_views[i++];
-            update(view, lights, size_of(view.sensor.get()));
+            update(view, lights, film_size(view.sensor->film()));
+            facts.mix(view.sensor->sampler()->sample_count());
             facts.mix(view.lamps ? view.lamps->points() : 0u);
             facts.mix(view.camera.lens + 2 * (uint64_t) view.size.x() +
                       ((uint64_t) view.size.y() << 32));
@@ -74,11 +90,11 @@ public:
     MANYLIGHTS_TRAVERSE(m_views)
 
 private:
-    static constexpr size_t kMost = 4;
-
     struct View {
         const Scene *scene = nullptr;
-        mitsuba::ref<Sensor> sensor;
+        /// The scene's own ones live as long as it does, of others the last one is kept
+        Sensor *sensor = nullptr;
+        mitsuba::ref<Sensor> kept;
         mitsuba::ref<Lights> lights;
         uint32_t version = 0;
         Size size        = 0;
@@ -90,9 +106,9 @@ private:
 
     static void update(View &view, const mitsuba::ref<Lights> &lights, const Size &size) {
         CameraView<float> camera;
-        bool may_find = Lamps::may_find(*lights, view.sensor.get());
+        bool may_find = Lamps::may_find(*lights, view.sensor);
         if (may_find)
-            camera = read_view(view.sensor.get());
+            camera = read_view(view.sensor);
         if (view.lights == lights && view.version == lights->version() &&
             dr::all(view.size == size) && (!may_find || view.camera == camera))
             return;
@@ -102,7 +118,7 @@ private:
         view.camera  = camera;
         view.lamps   = nullptr;
         if (may_find)
-            view.lamps = Lamps::find(*lights, view.sensor.get(), size, camera);
+            view.lamps = Lamps::find(*lights, view.sensor, size, camera);
         if (view.lamps)
             view.lamps->round_points();
     }
