@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests import light_scenes
+from tests.conftest import require_variant
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -164,6 +165,15 @@ def test_samplers(sampler):
     integrator = load_integrator("manylights_direct")
     names = ["intensity.value", "sensor.to_world"]
     assert_replays(mi.load_dict(scene), render_function(integrator, spp=4), names)
+
+
+@pytest.mark.parametrize("name", ["llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize("plugin_name", PLUGINS)
+def test_other_variants(plugin_name, name):
+    """Mitsuba's own integrators cannot be recorded in spectral ones."""
+    require_variant(name)
+    render = render_function(load_integrator(plugin_name))
+    assert_replays(load(), render, [".position", "sensor.to_world"])
 
 
 @pytest.mark.parametrize("opaque", [False, True])

@@ -6,6 +6,7 @@
  */
 
 #include "camera_sample.h"
+#include "color_tables.h"
 #include "film_channels.h"
 #include "first_hit.h"
 #include "lamp_splats.h"
@@ -119,18 +120,16 @@ public:
                 return;
             if (!is_recorded<Float>())
                 prepare_recording();
-            Base::traverse_1_cb_ro(payload, fn);
             DRJIT_MAP(DR_TRAVERSE_MEMBER_RO, m_facts, m_cache, m_views, m_learning,
-                      m_shape_numbers)
+                      m_shape_numbers, m_color_tables)
         }
     }
     void traverse_1_cb_rw(void *payload, dr::detail::traverse_callback_rw fn) override {
         if constexpr (dr::is_jit_v<Float>) {
             if (!jit_flag(JitFlag::EnableObjectTraversal))
                 return;
-            Base::traverse_1_cb_rw(payload, fn);
             DRJIT_MAP(DR_TRAVERSE_MEMBER_RW, m_facts, m_cache, m_views, m_learning,
-                      m_shape_numbers)
+                      m_shape_numbers, m_color_tables)
         }
     }
 
@@ -324,6 +323,7 @@ private:
     Learning m_learning;
     ShapeNumbers<Float, Spectrum> m_shape_numbers;
     mutable LampViews<Float, Spectrum> m_views;
+    ColorTables<Float, Spectrum> m_color_tables;
     mutable HostFacts<dr::uint32_array_t<dr::detached_t<Float>>> m_facts;
 };
 
