@@ -16,18 +16,19 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
 
  * - splitting_rate
    - |float|
-   - How many lights are considered at each shading point: about 8 times this number,
+   - How many lights are considered at each shading point: about 16 times this number,
      from 0 (a single random descent of the tree) to infinity (:code:`inf`: every light).
      (Default: 1)
 
  * - reservoirs
    - |int|
-   - Lights that are kept for a full evaluation of BSDF and emission, 1 to 64. (Default: 8)
+   - Lights that are kept for a full evaluation of BSDF and emission, 1 to 64. (Default: 16)
 
  * - shadow_rays
    - |int|
    - Lights that are tested for visibility at each shading point, 1 to :code:`reservoirs`.
-     (Default: 4)
+     With as many as there are reservoirs all kept lights are, and all lights at infinity.
+     (Default: 16)
 
  * - bsdf_samples
    - |int|
@@ -105,25 +106,26 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
 1. one random number cuts a tree of the lights into :math:`N'` candidates. Let
    :math:`w_l(x)` be the probability that a random descent of the tree, steered by a cheap
    bound :math:`h` of the light that a cluster may send to :math:`x`, ends at light
-   :math:`l`. With :math:`K = 8 \cdot` :code:`splitting_rate` points at equal distances,
+   :math:`l`. With :math:`K = 16 \cdot` :code:`splitting_rate` points at equal distances,
    :math:`l` becomes a candidate with probability :math:`p_l = \min(1, K w_l)`;
 
-2. the candidates are resampled with a heuristic :math:`H` of single lights to at most
-   :math:`m` (:code:`reservoirs`); one that holds the sum of weights :math:`W` has the
-   contribution weight :math:`C = W / H`;
+2. if there can be more than :math:`m` (:code:`reservoirs`), they are resampled with a heuristic :math:`H` of single lights to
+   :math:`m`; one that holds the sum of weights :math:`W` has the contribution weight
+   :math:`C = W / H`, in place of :math:`1 / p_l`;
 
 3. on each of these a point is sampled and :math:`F`, the product of BSDF, emission,
-   geometry and MIS weight, is evaluated without visibility. :math:`s`
-   (:code:`shadow_rays`) of them are chosen with a probability proportional to the
-   brightness :math:`|C F|`, the root mean square of its channels, and only these are traced:
+   geometry and MIS weight, is evaluated without visibility. With fewer than :math:`m` shadow
+   rays, :math:`s` (:code:`shadow_rays`) of them are chosen with a probability proportional
+   to the brightness :math:`|C F|`, the root mean square of its channels, and only these are
+   traced:
 
 .. math::
 
     L_o(x) \approx \sum_{i=1}^{s} V_i\, C_i\, F_i\, \max\left(1, \frac{\tau}{g_i}\right),
     \qquad g_i = |C_i F_i|,
 
-where :math:`\tau` is the step of the systematic sampling that chose them. The estimate is
-unbiased, whatever :math:`h` and :math:`H`. With at most :math:`m` lights there is no tree:
+where :math:`\tau` is the step of the systematic sampling that chose them (:math:`\tau = 0` if
+all are traced). The estimate is unbiased, whatever :math:`h` and :math:`H`. With at most :math:`m` lights there is no tree:
 all of them are kept. Environment maps, suns and directional lights always take part in step
 3.
 
@@ -131,8 +133,8 @@ all of them are kept. Environment maps, suns and directional lights always take 
 lights there are. **It works less well**
 
 - where most lights are hidden and there is too little to learn from, see below;
-- on glossy surfaces that reflect few of many bright lights: raise :code:`splitting_rate` and
-  :code:`reservoirs` together;
+- on glossy surfaces that reflect few of many bright lights: raise :code:`splitting_rate`,
+  :code:`reservoirs` and :code:`shadow_rays` together;
 - for very few lights, or lights of equal importance, where Mitsuba's :monosp:`direct` does
   the same with less arithmetic.
 
@@ -211,14 +213,14 @@ With :code:`learn_visibility` it cannot be recorded if the value is :code:`keep`
 
         <integrator type="manylights_direct">
             <float name="splitting_rate" value="1"/>
-            <integer name="shadow_rays" value="4"/>
+            <integer name="bsdf_samples" value="1"/>
         </integrator>
 
     .. code-tab:: python
 
         'type': 'manylights_direct',
         'splitting_rate': 1.0,
-        'shadow_rays': 4
+        'bsdf_samples': 1
 
  */
 
@@ -295,7 +297,7 @@ public:
                                           sampler->next_1d(active),
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
-        auto vertex  = direct.prepare(si, bsdf, nullptr, u, true, active);
+        auto vertex  = direct.prepare(si, bsdf, nullptr, u, active);
         Mask lit     = vertex.is_lit_surface(active);
         if (dr::any_or<true>(lit))
             result += direct.sample_lights(vertex, counts, light, lit);

@@ -28,19 +28,18 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
 
  * - splitting_rate
    - |float|
-   - How many lights are considered at the first vertex of a path: about 8 times this number,
+   - How many lights are considered at each vertex of a path: about 4 times this number,
      from 0 (a single random descent of the tree) to infinity (:code:`inf`: every light).
-     Later vertices consider 3/8 of them. (Default: 1)
+     (Default: 1)
 
  * - reservoirs
    - |int|
    - Lights that are kept for a full evaluation of scattering and emission, 1 to 64.
-     (Default: 8)
+     (Default: 16)
 
  * - shadow_rays
    - |int|
-   - Lights that are tested for visibility at the first vertex, 1 to :code:`reservoirs`; a
-     quarter of it at later ones. (Default: 4)
+   - Lights that are tested for visibility at each vertex, 1 to :code:`reservoirs`. (Default: 16)
 
  * - learn_visibility
    - |bool| or |string|

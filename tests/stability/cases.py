@@ -508,9 +508,9 @@ CASES = {
     "only-no-power": Case("no light has power", no_power, black=True),
     "no-lights": Case("no lights", lambda: scene([]), black=True),
     "one-light": Case("one light", few(1), variance=0.038),
-    "one-less-than-reservoirs": Case("N = m - 1", few(7), variance=0.00048),
-    "as-many-as-reservoirs": Case("N = m", few(8), variance=6.9e-05),
-    "one-more-than-reservoirs": Case("N = m + 1", few(9), variance=0.0095),
+    "one-less-than-reservoirs": Case("N = m - 1", few(15), variance=0.00048),
+    "as-many-as-reservoirs": Case("N = m", few(16), variance=6.9e-05),
+    "one-more-than-reservoirs": Case("N = m + 1", few(17), variance=0.0095),
     "huge-and-tiny-rough": Case(
         "4,000 tiny lamps and a huge one, rough metal",
         huge_and_tiny(0.5),

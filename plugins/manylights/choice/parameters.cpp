@@ -122,10 +122,7 @@ SamplingParameters read_parameters(const Properties &props) {
 }
 
 SamplingParameters read_path_parameters(const Properties &props) {
-    SamplingParameters p = read(props, kVolpath);
-    p.deeper_candidates  = 3.f / 8.f;
-    p.deeper_rays        = 1.f / 4.f;
-    return p;
+    return read(props, kVolpath);
 }
 
 std::vector<std::string> count_channels(const SamplingParameters &p) {

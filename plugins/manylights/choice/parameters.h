@@ -19,8 +19,9 @@ namespace manylights {
 
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
 constexpr float kMaxExpectedCandidates = 1 << 14;
-/// K for a splitting rate of 1
-constexpr float kCandidatesPerRate = 8.f;
+/// K for a splitting rate of 1. Light that has been reflected is dimmer, and rays that lead to
+/// the vertices of a path cost as much as shadow rays: there, fewer pay.
+constexpr float kCandidatesPerRate = 16.f, kCandidatesPerRateOnPaths = 4.f;
 
 /// What decides whether a node is split: the talk's two functions, or the variance
 enum class SplitFunction { Near, Far, Variance };
@@ -35,8 +36,6 @@ struct SamplingParameters {
     SplitFunction split_function;
     float splitting_rate;
     uint32_t reservoirs, shadow_rays, bsdf_samples;
-    /// What the vertices of a path after its first one get of candidates and shadow rays
-    float deeper_candidates = 1.f, deeper_rays = 1.f;
     /// Are the candidates and the visited nodes counted, in film channels?
     bool counts;
     LearnVisibility learn_visibility;
@@ -45,14 +44,8 @@ struct SamplingParameters {
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
-        return std::max(1.f, kCandidatesPerRate * splitting_rate);
-    }
-    /// The same, and the number of shadow rays, at later vertices
-    float expected_deeper() const {
-        return std::max(1.f, deeper_candidates * kCandidatesPerRate * splitting_rate);
-    }
-    uint32_t shadow_rays_deeper() const {
-        return (uint32_t) std::ceil(deeper_rays * (float) shadow_rays);
+        float unit = plugin == kVolpath ? kCandidatesPerRateOnPaths : kCandidatesPerRate;
+        return std::max(1.f, unit * splitting_rate);
     }
     /// Upper limit of the number of candidates
     float most_candidates() const {
@@ -74,13 +67,7 @@ struct SamplingParameters {
 /// Read and check the parameters; throws with the name, the value and what is allowed
 SamplingParameters read_parameters(const mitsuba::Properties &props);
 
-/**
- * The same for paths, where one direction is sampled at each vertex (no `bsdf_samples`).
- *
- * After the first vertex paths spend 3/8 of the candidates and a quarter of the shadow rays,
- * that is K = 3 and s = 1 by default: their light is dimmer, and the rays that lead to them cost
- * as much as shadow rays.
- */
+/// The same for paths, where one direction is sampled at each vertex (no `bsdf_samples`)
 SamplingParameters read_path_parameters(const mitsuba::Properties &props);
 
 /// Names of the film channels with counts

@@ -108,14 +108,13 @@ private:
  * any number of steps is unbiased; s steps always reach it.
  */
 template <typename Float>
-Float selection_threshold(const Slots<Float> &targets, size_t count, uint32_t most_picks,
-                          const Float &picks) {
+Float selection_threshold(const Slots<Float> &targets, size_t count, uint32_t picks) {
     Float sum(0.f);
     for (size_t i = 0; i < count; ++i)
         sum += targets[i];
-    Float tau = sum / picks;
-    for (uint32_t step = 1; step < most_picks; ++step) {
-        Float small(0.f), free(picks);
+    Float tau = sum / (float) picks;
+    for (uint32_t step = 1; step < picks; ++step) {
+        Float small(0.f), free((float) picks);
         for (size_t i = 0; i < count; ++i) {
             auto big = targets[i] >= tau;
             small += dr::select(big, 0.f, targets[i]);

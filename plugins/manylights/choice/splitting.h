@@ -44,12 +44,13 @@ template <typename Float> struct SplittingCursor {
         : rate(rate), xi(u), node(0), visits(0), function(function) {
         if (function != SplitFunction::Variance)
             return;
-        // Of all the light, which has a flux of 1, about 1 / distance^2 arrives
+        // Of all the light, which has a flux of 1, about 1 / distance^2 arrives. A node is split
+        // where 1 / (8 rate) of that is in doubt.
         BinaryView root(tree, UInt32(0));
         Float d2(root.data.entry(9));
         for (size_t i = 0; i < 3; ++i)
             d2 += dr::square(root.data.entry(6 + i) - at.p.entry(i));
-        this->rate = kCandidatesPerRate * rate * d2;
+        this->rate = 8.f * rate * d2;
     }
 
     Mask has_next() const { return node != kNone; }

@@ -63,14 +63,8 @@ public:
     /// A vertex with its random numbers; `inside` is null in scenes without media
     Vertex prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
                    const typename Vertex::InMedium *inside, const LightSample<Float> &u,
-                   const MaskD &first, Mask active) const {
-        Vertex vertex{ si,
-                       bsdf,
-                       inside,
-                       u,
-                       effort_of<FloatD>(m_strategy.params, first),
-                       traits(Extent::Point),
-                       active };
+                   Mask active) const {
+        Vertex vertex{ si, bsdf, inside, u, traits(Extent::Point), active };
         look_at_tree(vertex, active);
         return vertex;
     }
@@ -78,15 +72,8 @@ public:
     /// All of a segment in a homogeneous medium
     Vertex prepare_segment(const SurfaceInteraction3f &behind, const BSDFPtr &no_bsdf,
                            const typename Vertex::InMedium &inside,
-                           const LightSample<Float> &u, const MaskD &first,
-                           Mask active) const {
-        Vertex vertex{ behind,
-                       no_bsdf,
-                       &inside,
-                       u,
-                       effort_of<FloatD>(m_strategy.params, first),
-                       traits(Extent::Segment),
-                       active };
+                           const LightSample<Float> &u, Mask active) const {
+        Vertex vertex{ behind, no_bsdf, &inside, u, traits(Extent::Segment), active };
         look_at_tree(vertex, active);
         return vertex;
     }
@@ -109,7 +96,7 @@ public:
                            Mask active) const {
         if (m_strategy.items == 0)
             return Spectrum(0.f);
-        if (m_strategy.fate_at(vertex.effort) == Fate::TraceAll)
+        if (m_strategy.fate == Fate::TraceAll)
             return m_rays.trace_candidates(vertex, counts, light, active);
         return m_rays.trace_kept(vertex, m_kept.keep(vertex, counts, active), light,
                                  active);
@@ -146,10 +133,10 @@ public:
 
     /// Density with which \ref sample_lights chooses the direction that hit `light` or the
     /// environment, see \ref HitDensity
-    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree, const MaskD &first,
+    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree,
                       const SurfaceInteraction3f &hit, const UInt32D &light,
                       Mask active) const {
-        return m_density.density(at, u_tree, first, hit, light, active);
+        return m_density.density(at, u_tree, hit, light, active);
     }
 
 private:
@@ -198,7 +185,7 @@ private:
         Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
         Float light_pdf = dr::select(
             delta, 0.f,
-            hit_density(vertex.at, vertex.u.tree, true, hit, light, reflected && !delta));
+            hit_density(vertex.at, vertex.u.tree, hit, light, reflected && !delta));
         Float pdf        = bs.pdf * (float) m_strategy.params.bsdf_samples;
         Spectrum arrives = value * radiance * mis_weight<Float>(pdf, light_pdf) /
                            (float) m_strategy.params.bsdf_samples;

@@ -29,8 +29,8 @@ public:
     /// Density with which lights are sampled in the direction that hit `light` or the
     /// environment, seen from the receiver of a vertex and for its random number of the tree
     MI_NOINLINE Float density(const Receiver<FloatD> &at, const Float &u_tree,
-                              const MaskD &first, const SurfaceInteraction3f &hit,
-                              const UInt32D &light, Mask active) const {
+                              const SurfaceInteraction3f &hit, const UInt32D &light,
+                              Mask active) const {
         auto p = at.p;
         if (at.extent == Extent::Either)
             p -= at.distance * at.wi;
@@ -57,7 +57,7 @@ public:
                 result *= Float(dr::select(
                     at.length > 0.f, distances_to(tree, at, row).pdf(at.distance), 1.f));
             result *= Float(m_strategy.with_source<FloatD>([&](const auto &source) {
-                return source.inclusion_probability(tree, at, light, plain(u_tree), first,
+                return source.inclusion_probability(tree, at, light, plain(u_tree),
                                                     plain(found));
             }));
             result = dr::select(found, result, 0.f);

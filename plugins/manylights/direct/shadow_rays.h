@@ -54,8 +54,7 @@ public:
                 kept.target[m_strategy.slots + i] = target;
             }
             tau = selection_threshold<FloatD>(kept.target, m_strategy.items,
-                                              m_strategy.params.shadow_rays,
-                                              FloatD(vertex.effort.shadow_rays));
+                                              m_strategy.rays);
         }
 
         struct State {
@@ -67,7 +66,7 @@ public:
         };
         // Trace a ray to each item that is chosen; an item below tau gets what others lack
         State state{ UInt32D(0), Spectrum(0.f), media_rng(vertex), light.take() };
-        UInt32D rays = dr::minimum(vertex.effort.shadow_rays, m_strategy.items);
+        UInt32D rays = dr::opaque<UInt32D>(m_strategy.rays);
         MaskD on     = plain(active);
         loop(
             state, [&](const State &s) { return on && s.ray < rays; },
@@ -91,8 +90,7 @@ public:
         return state.result;
     }
 
-    /// No resampling, a shadow ray for every candidate: few lights, or the method
-    /// `adaptive_splitting`
+    /// No resampling, a shadow ray for every candidate
     Spectrum trace_candidates(const Vertex &vertex, Counts<Float> &counts,
                               GroupLight &light, Mask active) const {
         Spectrum result(0.f);
@@ -101,13 +99,9 @@ public:
                       : make_rng(plain_sample(vertex.u));
         if (m_strategy.slots > 0)
             m_strategy.with_source<FloatD>([&](const auto &source) {
-                using Source = std::decay_t<decltype(source)>;
-                // No method traces all of these: not compiled
-                if constexpr (!std::is_same_v<Source, SystematicSource<FloatD>>)
-                    result = trace_candidates(
-                        vertex,
-                        source.cursor(m_lights.tree(), vertex, plain(vertex.u.tree)), rng,
-                        counts, light, active);
+                result = trace_candidates(
+                    vertex, source.cursor(m_lights.tree(), vertex, plain(vertex.u.tree)),
+                    rng, counts, light, active);
             });
         if (m_strategy.infinite == 0)
             return result;
@@ -131,11 +125,12 @@ private:
             UInt32D slot;
             Spectrum result;
             Rng rng;
+            FloatD expected;
             GroupSums groups;
-            DRJIT_STRUCT(State, cursor, slot, result, rng, groups)
+            DRJIT_STRUCT(State, cursor, slot, result, rng, expected, groups)
             State(const Cursor &cursor, Rng &&rng, GroupSums &&groups)
                 : cursor(cursor), slot(0), result(0.f), rng(std::move(rng)),
-                  groups(std::move(groups)) {}
+                  expected(0.f), groups(std::move(groups)) {}
         };
         State state(cursor, std::move(rng), light.take());
         MaskD on = plain(active);
@@ -150,6 +145,13 @@ private:
                 sample.value *= Float(dr::rcp(p));
                 Spectrum arrives = trace_sample(vertex, sample, s.rng, valid);
                 s.result += arrives;
+                teach(vertex, candidate.light, sample, arrives, plain(valid));
+                if (m_strategy.params.counts)
+                    s.expected += dr::select(plain(valid),
+                                             m_samples.target(sample.unoccluded()) *
+                                                 dr::square(candidate.visibility) *
+                                                 m_lights.tree().unit,
+                                             0.f);
                 if (s.groups.size() > 0)
                     light.add(s.groups, arrives, Float(1.f),
                               m_lights.groups().of_light(m_lights.tree(), candidate.light,
@@ -159,6 +161,7 @@ private:
             },
             "Direct light: rays to all candidates");
         counts.add(state.slot, state.cursor.visits, active);
+        counts.expected += state.expected;
         rng = std::move(state.rng);
         light.give(std::move(state.groups));
         return state.result;
@@ -204,16 +207,23 @@ private:
 
         Spectrum result = trace_sample(vertex, sample, rng, active);
         if (m_lights.tree().visibility) {
-            // Far from the smallest floats, which some threads round to zero
-            constexpr float least = 1e-30f;
-            MaskD traced          = plain(active) && chosen.item < m_strategy.slots &&
-                                    m_samples.target(sample.unoccluded()) > least;
-            UInt32D slot          = dr::minimum(chosen.item, m_strategy.slots - 1u);
-            count_ray(m_lights.tree(), vertex.at.cell,
-                      read_slot<UInt32D>(kept.light, slot, m_strategy.slots),
-                      m_samples.target(result) > least, traced);
+            UInt32D slot = dr::minimum(chosen.item, m_strategy.slots - 1u);
+            teach(vertex, read_slot<UInt32D>(kept.light, slot, m_strategy.slots), sample,
+                  result, plain(active) && chosen.item < m_strategy.slots);
         }
         return result;
+    }
+
+    /// What a ray has found, for those who learn
+    void teach(const Vertex &vertex, const UInt32D &light, const Sample &sample,
+               const Spectrum &arrives, const MaskD &traced) const {
+        if (!m_lights.tree().visibility)
+            return;
+        // Far from the smallest floats, which some threads round to zero
+        constexpr float least = 1e-30f;
+        count_ray(m_lights.tree(), vertex.at.cell, light,
+                  m_samples.target(arrives) > least,
+                  traced && m_samples.target(sample.unoccluded()) > least);
     }
 
     /// F / p of what is in a slot

@@ -7,7 +7,8 @@
  *     method, number of lights        source of candidates    fate of candidates
  *     any, N <= s                     AllLights               TraceAll
  *     any, N <= m                     AllLights               KeepAll
- *     resampled_tree, K <= m; tree    Systematic              KeepAll
+ *     resampled_tree, K <= s; tree    Systematic              TraceAll
+ *     resampled_tree, K <= m          Systematic              KeepAll
  *     resampled_tree, K > m           Systematic              Resample
  *     exhaustive, N > m               AllLights               Resample
  *     talk                            Splitting               Resample
@@ -32,17 +33,6 @@ enum class Source { AllLights, Systematic, Splitting };
 /// What becomes of candidates: a shadow ray for each, a slot for each, or resampling
 enum class Fate { TraceAll, KeepAll, Resample };
 
-/// What is spent on the first vertex of a path, and on the others
-template <typename FloatD>
-Effort<FloatD> effort_of(const SamplingParameters &params,
-                         const dr::mask_t<FloatD> &first) {
-    using UInt32D = dr::uint32_array_t<FloatD>;
-    return { dr::select(first, dr::opaque<FloatD>(params.expected_candidates()),
-                        dr::opaque<FloatD>(params.expected_deeper())),
-             dr::select(first, dr::opaque<UInt32D>(params.shadow_rays),
-                        dr::opaque<UInt32D>(params.shadow_rays_deeper())) };
-}
-
 /*
  * The sources: `cursor` starts at the first candidate of a vertex, with its random number of
  * the tree; `inclusion_probability` is that of `light` to be one of them.
@@ -58,8 +48,7 @@ template <typename FloatD> struct AllLightsSource {
         return AllLights<FloatD>(dr::opaque<UInt32D>(tree.light_count));
     }
     FloatD inclusion_probability(const TreeView<FloatD> &, const Receiver<FloatD> &,
-                                 const UInt32D &, const FloatD &, const MaskD &,
-                                 const MaskD &) const {
+                                 const UInt32D &, const FloatD &, const MaskD &) const {
         return AllLights<FloatD>::inclusion_probability();
     }
 };
@@ -71,13 +60,14 @@ template <typename FloatD> struct SystematicSource {
 
     template <typename Vertex>
     auto cursor(const TreeView<FloatD> &, const Vertex &vertex, const FloatD &u) const {
-        return SystematicCursor<FloatD>(vertex.top, vertex.effort.candidates, u);
+        return SystematicCursor<FloatD>(
+            vertex.top, dr::opaque<FloatD>(params.expected_candidates()), u);
     }
     FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
-                                 const UInt32D &light, const FloatD &, const MaskD &first,
+                                 const UInt32D &light, const FloatD &,
                                  const MaskD &active) const {
         return SystematicCursor<FloatD>::inclusion_probability(
-            tree, at, light, effort_of<FloatD>(params, first).candidates, active);
+            tree, at, light, dr::opaque<FloatD>(params.expected_candidates()), active);
     }
 };
 
@@ -92,7 +82,7 @@ template <typename FloatD> struct SplittingSource {
         return start(tree, vertex.at, u);
     }
     FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
-                                 const UInt32D &light, const FloatD &u, const MaskD &,
+                                 const UInt32D &light, const FloatD &u,
                                  const MaskD &active) const {
         return start(tree, at, u).inclusion_probability(tree, at, light, active);
     }
@@ -110,7 +100,6 @@ private:
 struct Strategy {
     const SamplingParameters &params;
     Source source;
-    /// Where there are not enough shadow rays for all lights
     Fate fate;
     /// Does h or H compare lights with each other?
     bool compares;
@@ -118,8 +107,9 @@ struct Strategy {
     uint32_t slots, infinite, items;
     /// Probability with which a light at infinity is an item: of many, one is chosen
     float infinite_probability;
-    /// Are there more items than shadow rays, so that some are chosen?
+    /// Do shadow rays go to some of the kept lights only? If not, lights at infinity all get one
     bool chooses;
+    uint32_t rays;
     /// Are the samples behind the targets kept for the rays instead of being computed again?
     /// That pays in scalar variants; in LLVM variants each slot is written with a selection.
     bool keeps_samples;
@@ -134,29 +124,18 @@ struct Strategy {
                                                 : Source::Systematic;
         float most    = all ? (float) lights : params.most_candidates();
         bool fits     = most <= (float) params.reservoirs;
-        fate          = params.traces_all() ? Fate::TraceAll
-                        : fits              ? Fate::KeepAll
-                                            : Fate::Resample;
-        compares      = !(all && fits);
-        slots         = fits ? std::min((uint32_t) most, lights) : params.reservoirs;
         bool few      = infinite_lights <= kMaxInfinite;
+        slots         = fits ? std::min((uint32_t) most, lights) : params.reservoirs;
         infinite      = few ? infinite_lights : 1;
         items         = slots + infinite;
-        chooses       = !params.traces_all() && items > params.shadow_rays_deeper();
+        compares      = !(all && fits);
+        chooses       = !params.traces_all() && slots > params.shadow_rays;
+        fate          = !fits && !params.traces_all() ? Fate::Resample
+                        : chooses                     ? Fate::KeepAll
+                                                      : Fate::TraceAll;
+        rays          = chooses ? params.shadow_rays : items;
         keeps_samples = exact_targets && chooses;
         infinite_probability = few ? 1.f : 1.f / infinite_lights;
-    }
-
-    /// With slots and shadow rays for all lights nothing has to be chosen. Kernels are the same
-    /// for all vertices, scalar variants look at each.
-    template <typename FloatD> Fate fate_at(const Effort<FloatD> &effort) const {
-        bool enough;
-        if constexpr (dr::is_jit_v<FloatD>)
-            enough = !chooses;
-        else
-            enough = items <= effort.shadow_rays;
-        bool all_kept = source == Source::AllLights && fate == Fate::KeepAll;
-        return all_kept && enough ? Fate::TraceAll : fate;
     }
 
     /// Call f with the source of candidates

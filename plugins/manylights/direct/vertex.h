@@ -22,12 +22,6 @@ template <typename Float> struct LightSample {
     Float distance = Float(0.f);
 };
 
-/// How many lights a vertex considers (expected candidates K), and how many it traces
-template <typename Float> struct Effort {
-    Float candidates;
-    dr::uint32_array_t<Float> shadow_rays;
-};
-
 /// What light sampling did, for those who ask: where nobody does, it drops out of kernels
 template <typename Float> struct Counts {
     using FloatD      = dr::detached_t<Float>;
@@ -84,7 +78,6 @@ template <typename Float, typename Spectrum> struct Vertex {
     /// Null if the scene has no media
     const InMedium *inside;
     LightSample<Float> u;
-    Effort<FloatD> effort;
     /// As the tree sees it
     Receiver<FloatD> at;
     /// Where descents of the tree begin, if it has one
@@ -94,10 +87,8 @@ template <typename Float, typename Spectrum> struct Vertex {
     Float flight_ratio = Float(1.f);
 
     Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
-           const LightSample<Float> &u, const Effort<FloatD> &effort,
-           const ReceiverTraits &traits, Mask active)
-        : si(si), bsdf(bsdf), inside(inside), u(u), effort(effort),
-          at(dr::zeros<Receiver<FloatD>>()) {
+           const LightSample<Float> &u, const ReceiverTraits &traits, Mask active)
+        : si(si), bsdf(bsdf), inside(inside), u(u), at(dr::zeros<Receiver<FloatD>>()) {
         at.traits()  = traits;
         Mask surface = on_surface(active);
         if (at.extent == Extent::Point && dr::any_or<true>(surface))

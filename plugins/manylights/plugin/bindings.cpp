@@ -220,7 +220,7 @@ Choices select_items(const Numbers &targets, uint32_t picks, float offset) {
     Slots<float> slots = make_slots<float>(count, 0.f);
     for (size_t i = 0; i < count; ++i)
         slots[i] = targets(i);
-    float tau = selection_threshold<float>(slots, count, picks, (float) picks);
+    float tau = selection_threshold<float>(slots, count, picks);
     Choices result;
     for (uint32_t i = 0; i < picks; ++i) {
         auto chosen = select_item<float>(slots, count, tau, (i + offset) * tau);

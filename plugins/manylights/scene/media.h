@@ -111,6 +111,46 @@ public:
     MI_NOINLINE Spectrum transmittance(const Interaction3f &from, const Point3f &to,
                                        const Mask &close, const MediumPtr &medium,
                                        Rng &rng, Mask active) const {
+        Ray3f ray    = shadow_ray(from, to, close);
+        Mask blocked = m_scene->ray_test(ray, active), clear = active && !blocked;
+        Spectrum result(0.f);
+        // Most rays meet nothing: cheaper to find out than what they meet, and where
+        if (dr::any_or<true>(clear)) {
+            result      = Spectrum(1.f) & clear;
+            Mask inside = clear && medium != nullptr;
+            if (dr::any_or<true>(inside)) {
+                Float distance = dr::norm(to - from.p);
+                ray.o          = from.p;
+                ray.d          = (to - from.p) / distance;
+                dr::masked(result, inside) =
+                    within_medium(medium, ray, distance, rng, inside);
+            }
+        }
+        if (m_kinds.borders && dr::any_or<true>(blocked))
+            dr::masked(result, blocked) =
+                through_borders(from, to, close, medium, rng, blocked);
+        return result;
+    }
+
+    /// The medium on the side of `si` that the direction d points to
+    MediumPtr medium_beyond(const SurfaceInteraction3f &si, const MediumPtr &current,
+                            const Vector3f &d, Mask active) const {
+        MediumPtr result = current;
+        active &= si.is_valid();
+        if constexpr (!dr::is_jit_v<Float>) {
+            if (!active)
+                return result;
+        }
+        Mask border                = active && si.is_medium_transition();
+        dr::masked(result, border) = si.target_medium(d);
+        return result;
+    }
+
+private:
+    /// The same, piece by piece
+    Spectrum through_borders(const Interaction3f &from, const Point3f &to,
+                             const Mask &close, const MediumPtr &medium, Rng &rng,
+                             Mask active) const {
         struct State {
             Mask active;
             Ray3f ray;
@@ -158,21 +198,6 @@ public:
         return state.result;
     }
 
-    /// The medium on the side of `si` that the direction d points to
-    MediumPtr medium_beyond(const SurfaceInteraction3f &si, const MediumPtr &current,
-                            const Vector3f &d, Mask active) const {
-        MediumPtr result = current;
-        active &= si.is_valid();
-        if constexpr (!dr::is_jit_v<Float>) {
-            if (!active)
-                return result;
-        }
-        Mask border                = active && si.is_medium_transition();
-        dr::masked(result, border) = si.target_medium(d);
-        return result;
-    }
-
-private:
     /// Transmittance of a piece of a ray, closed form or ratio tracking
     UnpolarizedSpectrum within_medium(const MediumPtr &medium, const Ray3f &ray,
                                       const Float &distance, Rng &rng,

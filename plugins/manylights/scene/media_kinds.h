@@ -17,10 +17,12 @@ struct MediaKinds {
     bool chromatic = false, chromatic_majorants = false;
     /// Do homogeneous ones scatter?
     bool scattering = false;
+    /// Do any surfaces let light pass straight on?
+    bool borders = false;
 
     uint32_t bits() const {
         return any + 2 * homogeneous + 4 * heterogeneous + 8 * chromatic +
-               16 * scattering + 32 * chromatic_majorants;
+               16 * scattering + 32 * chromatic_majorants + 64 * borders;
     }
 };
 
@@ -37,6 +39,7 @@ template <typename Float, typename Spectrum> struct MediumReader {
         for_each_shape(scene, [&](const auto *shape) {
             add(kinds, shape->interior_medium());
             add(kinds, shape->exterior_medium());
+            kinds.borders |= has_flag(shape->bsdf()->flags(), mitsuba::BSDFFlags::Null);
         });
         for (const auto &sensor : scene->sensors())
             add(kinds, sensor->medium());

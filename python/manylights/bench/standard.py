@@ -12,7 +12,7 @@ STANDARD_BUDGET, QUICK_BUDGET = 0.5, 0.15
 
 #: Values of single parameters, around their defaults, that show what the parameters do.
 SPLITTING_RATES = (0, 0.5, 1, 2, 4)
-RESERVOIRS, SHADOW_RAYS = (4, 8, 16), (1, 2, 4, 8)
+RESERVOIRS, SHADOW_RAYS = (4, 8, 16, 32), (1, 2, 4, 8, 16)
 
 SWEEPS = (
     *(f"resampled_tree:splitting_rate={value}" for value in SPLITTING_RATES),

@@ -26,7 +26,7 @@ HELP = """\
 examples:
   manylights render scene.xml -o image.exr --spp 64
   manylights render scene.usdc -o image.exr --until-noise 0.02 --checkpoint 300
-  manylights render scene.xml -o image.exr --for 10m --set shadow_rays=8
+  manylights render scene.xml -o image.exr --for 10m --set splitting_rate=2
 
 Renders a scene to an OpenEXR file and writes a PNG preview beside it. SCENE is an XML
 file of Mitsuba, or a USD stage (.usd, .usda, .usdc, .usdz).

@@ -54,8 +54,8 @@ HIDE_EMITTERS = Parameter(BOOLEAN, False)
 #: What both plugins accept to steer and to watch the choice of lights.
 SAMPLING_PARAMETERS = {
     "splitting_rate": Parameter("float >= 0 or inf", 1.0, symbol="gamma"),
-    "reservoirs": Parameter("integer from 1 to 64", 8, symbol="m"),
-    "shadow_rays": Parameter("integer from 1 to the number of reservoirs", 4, symbol="s"),
+    "reservoirs": Parameter("integer from 1 to 64", 16, symbol="m"),
+    "shadow_rays": Parameter("integer from 1 to the number of reservoirs", 16, symbol="s"),
     "method": Parameter(f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", METHODS[0]),
     "split_function": Parameter("near or far", "near", "for method=talk only"),
     "learn_visibility": Parameter("true, false or keep", True, f"for method={METHODS[0]} only"),
