@@ -105,7 +105,7 @@ def test_a_wrong_word_in_the_documentation_is_found(tables):
     text = (SOURCES / "manylights_direct.cpp").read_text()
     table = tables["manylights_direct"]
     for old, new in (
-        ("(Default: 8)", "(Default: 9)"),
+        ("(Default: 16)", "(Default: 9)"),
         ("1 to 64", "1 to 32"),
         (":code:`far`", ":code:`away`"),
         (" * - counts\n   - |bool|", " * - counts\n   - |int|"),
