@@ -309,3 +309,79 @@ def test_gradients_are_those_of_camera_rays(llvm, direct):
     dr.backward(dr.sum(image, axis=None))
     gradient = np.array(dr.grad(parameters[key])).ravel()
     np.testing.assert_allclose(gradient, covered(0.12**2), rtol=0.15)
+
+
+def camera_of(scene):
+    """The name of the camera's place among the scene's parameters."""
+    return next(key for key in mi.traverse(scene).properties if key.endswith("sensor.to_world"))
+
+
+def moved_camera(parameters, scene):
+    place = mi.ScalarTransform4f().translate([0.1, -0.05, 0.3])
+    key = camera_of(scene)
+    parameters[key] = type(parameters[key])(place.matrix) @ parameters[key]
+
+
+def changed(parameters, key, factor):
+    parameters[key] = type(parameters[key])(parameters[key] * factor)
+
+
+CHANGES = {
+    "camera": moved_camera,
+    "field of view": lambda p, scene: changed(
+        p, camera_of(scene).replace("to_world", "x_fov"), 0.8
+    ),
+    "lamp": lambda p, scene: changed(p, "small.vertex_positions", 1.3),
+    "radiance": lambda p, scene: changed(p, "lamp_1.emitter.radiance.value", 1.2),
+}
+
+
+def scene_of_a_mesh():
+    """Lamps, one of which is a mesh."""
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": RADIANCE.tolist()}}
+    properties = mi.Properties()
+    properties["emitter"] = mi.load_dict(emitter)
+    mesh = mi.Mesh("small", 3, 1, props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = [-0.4, 0, 4, -0.4, 0.03, 4, -0.37, 0, 4]
+    parameters["faces"] = [0, 1, 2]
+    parameters.update()
+    return mi.load_dict(scene_of(more={"small": mesh}))
+
+
+def render_once(scene, integrator=None, **options):
+    return np.array(mi.render(scene, integrator=integrator, spp=4, seed=3, **options))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("change", CHANGES)
+def test_points_follow_changes(variant, change):
+    """What is known of lamps in view is as if nothing had been rendered before."""
+    scene = scene_of_a_mesh()
+    integrator = scene.integrator()
+    before = render_once(scene, integrator)
+    assert np.array_equal(before, render_once(scene, integrator))
+    parameters = mi.traverse(scene)
+    CHANGES[change](parameters, scene)
+    parameters.update()
+    after = render_once(scene, integrator)
+    assert not np.array_equal(before, after)
+    assert np.array_equal(after, render_once(scene, mi.load_dict({"type": "manylights_direct"})))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+def test_points_of_several_sensors(variant):
+    """In turn, of more views than are kept: other places, film sizes, borders and windows."""
+    films = [
+        *({"width": 16 + i, "height": 12} for i in range(7)),
+        {"sample_border": True, "rfilter": {"type": "gaussian"}},
+        {"crop_offset_x": 3, "crop_offset_y": 5, "crop_width": 21, "crop_height": 14},
+    ]
+    scene = scene_of_a_mesh()
+    sensors = [mi.load_dict(scene_of(film=film)["sensor"]) for film in films]
+    integrator = scene.integrator()
+    first = [render_once(scene, integrator, sensor=each) for each in sensors]
+    for sensor, image in zip(sensors, first, strict=True):
+        fresh = mi.load_dict({"type": "manylights_direct"})
+        assert np.array_equal(image, render_once(scene, integrator, sensor=sensor))
+        assert np.array_equal(image, render_once(scene, fresh, sensor=sensor))

@@ -240,29 +240,28 @@ public:
     MI_IMPORT_TYPES(Scene, Sensor)
     using Splats = LampSplats<Float, Spectrum>;
     using Lamps  = typename Splats::Lamps;
-    using Lights = typename Splats::Lights;
-
-    using Views = LampViews<Float, Spectrum>;
+    using Views  = LampViews<Float, Spectrum>;
 
     /**
-     * @param known  where camera rays find them
-     * @param views  those of functions that are recorded
-     * @param shown  can there be any?
+     * @param known      where camera rays find them
+     * @param views      those of functions that are recorded
+     * @param rendering  has those of other functions
+     * @param shown      can there be any?
      * The others are those of \ref LampSplats.
      */
-    LampPasses(std::shared_ptr<Lamps> &known, const Views &views, const Lights &lights,
-               const Scene *scene, Sensor *sensor, bool shown, const MediaKinds &media,
-               const FilmChannels &channels)
+    template <typename Rendering>
+    LampPasses(std::shared_ptr<const Lamps> &known, const Views &views,
+               const Rendering &rendering, const Scene *scene, Sensor *sensor, bool shown,
+               const MediaKinds &media, const FilmChannels &channels)
         : m_known(known) {
         auto size = film_size(sensor->film());
-        if (shown && is_recorded<Float>()) {
-            m_known = views.find(scene, sensor, lights, size);
-        } else if (shown) {
-            m_known = Lamps::find(lights, sensor, size);
-        }
+        if (shown && is_recorded<Float>())
+            m_known = views.find(scene, sensor, rendering.lights(), size);
+        else if (shown)
+            m_known = rendering.lamps(sensor, size);
         if (m_known)
-            m_splats = std::make_unique<Splats>(scene, lights, *m_known, media, sensor,
-                                                channels);
+            m_splats = std::make_unique<Splats>(scene, rendering.lights(), *m_known,
+                                                media, sensor, channels);
     }
     ~LampPasses() { m_known.reset(); }
     LampPasses(const LampPasses &) = delete;
@@ -273,7 +272,7 @@ public:
     }
 
 private:
-    std::shared_ptr<Lamps> &m_known;
+    std::shared_ptr<const Lamps> &m_known;
     std::unique_ptr<Splats> m_splats;
 };
 

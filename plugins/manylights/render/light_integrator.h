@@ -84,7 +84,7 @@ public:
             has_entry_for_each_sample(sensor))
             return Base::render(scene, sensor, seed, spp, develop, evaluate);
         Flag rendering(m_rendering);
-        return render_passes(guard.lights(), scene, sensor, seed, spp, develop, evaluate);
+        return render_passes(guard, scene, sensor, seed, spp, develop, evaluate);
     }
 
     TensorXf render_forward(Scene *scene, void *params, Sensor *sensor, UInt32 seed,
@@ -190,7 +190,7 @@ protected:
     Cache m_cache;
     FilmChannels m_channels;
     /// Of the rendering, those that it samples, too; null if there are none
-    std::shared_ptr<Lamps> m_lamps;
+    std::shared_ptr<const Lamps> m_lamps;
 
 private:
     using Renderer = std::conditional_t<dr::is_jit_v<Float>,
@@ -242,11 +242,12 @@ private:
         m_cache.forget_visibility();
     }
 
-    TensorXf render_passes(Lights &lights, Scene *scene, Sensor *sensor,
-                           const UInt32 &seed, uint32_t spp, bool develop,
+    TensorXf render_passes(const typename Cache::Rendering &rendering, Scene *scene,
+                           Sensor *sensor, const UInt32 &seed, uint32_t spp, bool develop,
                            bool evaluate) {
         m_stop = false;
         m_render_timer.reset();
+        Lights &lights   = rendering.lights();
         Film *film       = sensor->film();
         Sampler *sampler = sensor->sampler();
         auto size        = film_size(film);
@@ -268,7 +269,7 @@ private:
         bool shows_lamps =
             shows_emitters() && !has_flag(film->flags(), mitsuba::FilmFlags::Special);
         LampPasses<Float, Spectrum> lamps(
-            m_lamps, m_views, lights, scene, sensor, shows_lamps,
+            m_lamps, m_views, rendering, scene, sensor, shows_lamps,
             media(lights, scene, sensor->medium()), m_channels);
         Renderer renderer(*this, scene, sensor, channels, m_block_size);
         for (size_t i = 0; i < plan.size() && !should_stop(); ++i) {

@@ -72,6 +72,18 @@ template <typename Float> struct CameraView {
 
     bool has_lens() const { return lens; }
 
+    /// On the host
+    bool operator==(const CameraView &other) const {
+        bool same = lens == other.lens && radius == other.radius &&
+                    inverse_focus == other.inverse_focus &&
+                    near_clip == other.near_clip && far_clip == other.far_clip &&
+                    dr::all(position == other.position) &&
+                    dr::all(scale == other.scale) && dr::all(shift == other.shift);
+        for (size_t i = 0; i < 3; ++i)
+            same &= dr::all(axes[i] == other.axes[i]);
+        return same;
+    }
+
     /// The same numbers for kernels that do not depend on them
     template <typename Value> CameraView<Value> opaque() const {
         CameraView<Value> result;
@@ -90,16 +102,6 @@ template <typename Float> struct CameraView {
         result.far_clip      = dr::opaque<Value>(far_clip);
         result.lens          = lens;
         return result;
-    }
-
-    /// For host variables
-    bool operator==(const CameraView &other) const {
-        bool same = lens == other.lens && radius == other.radius &&
-                    inverse_focus == other.inverse_focus &&
-                    near_clip == other.near_clip && far_clip == other.far_clip &&
-                    dr::all(position == other.position && axes[0] == other.axes[0] &&
-                            axes[1] == other.axes[1] && axes[2] == other.axes[2]);
-        return same && dr::all(scale == other.scale && shift == other.shift);
     }
 
     MANYLIGHTS_TRAVERSE(position, axes, scale, shift, radius, inverse_focus, near_clip,

@@ -118,7 +118,7 @@ private:
         view.camera  = camera;
         view.lamps   = nullptr;
         if (may_find)
-            view.lamps = Lamps::find(*lights, view.sensor, size, camera);
+            view.lamps = Lamps::choose(*lights, camera, size, Lamps::border(view.sensor));
         if (view.lamps)
             view.lamps->round_points();
     }

@@ -13,115 +13,12 @@
  * All of this is the same for all samples of a pixel, so that they can be rendered in any passes.
  */
 
-#include "camera_view.h"
-#include "manylights/base/host_view.h"
-#include "manylights/kinds/kinds.h"
+#include "lamp_points.h"
+#include "manylights/base/host_storage.h"
 #include "scene_lights.h"
 #include <memory>
 
 namespace manylights {
-
-/// The image of a lamp, blurred by the lens
-struct LampImage {
-    /// Pixels that it touches, and the share of them that it covers: that of camera rays that
-    /// hit it. Both are 0 for what is out of sight
-    float touched = 0, share = 0;
-
-    /**
-     * @param size    pixels that are rendered
-     * @param border  of them, those beyond each side of the film
-     */
-    static LampImage of(const LightRow &row, const CameraView<float> &camera,
-                        const mitsuba::Vector<uint32_t, 2> &size, uint32_t border) {
-        auto seen   = with_kind(kind_of(row), [&](auto light) {
-            return light.appearance(Row<float>{ row.geometry }, camera.position, 0.f);
-        });
-        auto center = camera.position + seen.w;
-        float depth = camera.depth(center);
-        if (!(seen.intensity > 0 && depth > camera.near_clip && depth < camera.far_clip))
-            return {};
-        float diameter = light_diameter(row);
-        if (!(diameter > 0 && depth - diameter > camera.near_clip))
-            return {};
-        float density = camera.pixels() / (depth * depth),
-              covered = density * seen.intensity * dr::norm(seen.w) / depth,
-              extent  = diameter * std::sqrt(density),
-              blur    = camera.radius * std::abs(camera.inverse_focus - 1 / depth) *
-                        std::sqrt(camera.pixels());
-        auto at       = camera.on_film(center, camera.position);
-        float margin  = (float) border + extent + blur;
-        for (size_t i = 0; i < 2; ++i)
-            if (!(at[i] > -margin && at[i] < (float) (size[i] - 2 * border) + margin))
-                return {};
-        // The area of what is blurred with a disk and a pixel
-        float touched =
-            covered + 2 * extent + 1 + blur * (2 * extent + 4 + dr::Pi<float> * blur);
-        return covered > 0 && std::isfinite(touched)
-                   ? LampImage{ touched, covered / touched }
-                   : LampImage();
-    }
-};
-
-/**
- * How many points the lamps of a table get for each sample of the pixels.
- *
- * Where a lamp adds L k to a pixel, with the share k of its camera rays, and others add B, the
- * square of the relative error is (L k)^2 / ((B + L k)^2 (k + r)) with r points for each pixel that
- * the lamp touches. Of all r with one sum the best ones are k + r = s L k / (B + L k), or 0 where
- * camera rays do well alone; s is at most 1.
- */
-class LampPoints {
-public:
-    LampPoints(const LightRow *rows, uint32_t count, const CameraView<float> &camera,
-               const mitsuba::Vector<uint32_t, 2> &size, uint32_t border)
-        : m_rows(rows), m_images(count) {
-        for_chunks(count, [&](size_t, size_t begin, size_t end) {
-            for (size_t i = begin; i < end; ++i)
-                m_images[i] = LampImage::of(rows[i], camera, size, border);
-        });
-        double light = 0, pixels = (double) size.x() * size.y();
-        for (uint32_t i = 0; i < count; ++i) {
-            const LampImage &image = m_images[i];
-            light += (double) rows[i].brightness * image.touched * image.share;
-            if (image.touched > 0 && image.share < kMostShare)
-                m_small.push_back(i);
-        }
-        m_others = kOthers * light / pixels;
-        if (sum() <= kMostPoints * pixels)
-            return;
-        for (double step = .5; step > 1e-3; step *= .5)
-            m_scale += sum() > kMostPoints * pixels ? -step : step;
-    }
-
-    /// Lamps that may get any
-    const std::vector<uint32_t> &small() const { return m_small; }
-
-    double points(uint32_t i) const {
-        double share = m_images[i].share, light = m_rows[i].brightness * share,
-               part = light > 0 ? light / (m_others + light) : 0;
-        return m_images[i].touched * std::max(m_scale * part - share, 0.);
-    }
-
-private:
-    /// Of all lamps, for each pixel and sample: a point takes less time than a camera ray
-    static constexpr double kMostPoints = .1;
-    /// The light B of a pixel, of the mean of all that lamps may show: many are hidden
-    static constexpr double kOthers = .1;
-    /// Above this share a lamp is large: camera rays do well alone
-    static constexpr float kMostShare = .25f;
-
-    double sum() const {
-        double result = 0;
-        for (uint32_t i : m_small)
-            result += points(i);
-        return result;
-    }
-
-    const LightRow *m_rows;
-    HostVector<LampImage> m_images;
-    std::vector<uint32_t> m_small;
-    double m_others, m_scale = 1;
-};
 
 template <typename Float, typename Spectrum> class LampsInView {
 public:
@@ -140,18 +37,17 @@ public:
         MaskD active;
     };
 
-    /// Null if no lamp is worth it
-    static std::shared_ptr<LampsInView> find(const Lights &lights, const Sensor *sensor,
-                                             const mitsuba::Vector<uint32_t, 2> &size) {
-        if (!may_find(lights, sensor))
-            return {};
-        return find(lights, sensor, size, read_view(sensor));
-    }
-    static std::shared_ptr<LampsInView> find(const Lights &lights, const Sensor *sensor,
-                                             const mitsuba::Vector<uint32_t, 2> &size,
-                                             const CameraView<float> &camera) {
+    /**
+     * Null if no lamp is worth it.
+     * @param size    pixels that are rendered
+     * @param border  of them, those beyond each side of the film
+     */
+    static std::shared_ptr<LampsInView> choose(const Lights &lights,
+                                               const CameraView<float> &camera,
+                                               const mitsuba::Vector<uint32_t, 2> &size,
+                                               uint32_t border) {
         std::shared_ptr<LampsInView> result(new LampsInView(lights));
-        if (!result->choose(camera, sensor->film(), size))
+        if (!result->choose(camera, size, border))
             return {};
         result->m_camera = camera.template opaque<FloatD>();
         return result;
@@ -160,6 +56,12 @@ public:
     /// Is there any lamp, and a camera with a view?
     static bool may_find(const Lights &lights, const Sensor *sensor) {
         return lights.can_be_hit() && lights.tree().light_count > 0 && has_view(sensor);
+    }
+
+    /// Pixels that are rendered beyond each side of the film
+    static uint32_t border(const Sensor *sensor) {
+        const auto *film = sensor->film();
+        return film->sample_border() ? film->rfilter()->border_size() : 0;
     }
 
     MANYLIGHTS_TRAVERSE(m_camera, m_rates, m_chosen, m_ends, m_count, m_sum, m_mean_sum)
@@ -243,39 +145,37 @@ private:
     explicit LampsInView(const Lights &lights) : m_lights(lights) {}
 
     /// Returns false if there are none
-    bool choose(const CameraView<float> &camera,
-                const mitsuba::Film<Float, Spectrum> *film,
-                const mitsuba::Vector<uint32_t, 2> &size) {
+    bool choose(const CameraView<float> &camera, const mitsuba::Vector<uint32_t, 2> &size,
+                uint32_t border) {
         HostView rows(m_lights.tree().rows);
-        const LightRow *row = (const LightRow *) rows.data();
-        uint32_t count      = m_lights.tree().light_count;
-        LampPoints lamps(row, count, camera, size,
-                         film->sample_border() ? film->rfilter()->border_size() : 0);
+        uint32_t count = m_lights.tree().light_count;
+        LampPoints lamps((const LightRow *) rows.data(), count, camera, size, border);
 
-        HostVector<float> rates(count);
-        std::fill(rates.begin(), rates.end(), 0.f);
+        HostStorage<mitsuba::DynamicBuffer<FloatD>> storage;
+        float *rates = storage.allocate(count);
+        std::fill_n(rates, count, 0.f);
         uint64_t end = 0;
         double sum = 0, mean_sum = 0;
         std::vector<uint32_t> chosen;
         std::vector<uint64_t> ends;
-        for (uint32_t i : lamps.small()) {
+        lamps.for_each([&](uint32_t i, double number, float brightness) {
             // Fractions of 32 digits, so that both kinds of samples have the same numbers
-            auto points = (uint64_t) (0x1p32 * lamps.points(i));
+            auto points = (uint64_t) (0x1p32 * number);
             rates[i]    = (float) points * 0x1p-32f;
             if (points == 0)
-                continue;
+                return;
             chosen.push_back(i);
             ends.push_back(end += points);
-            sum += row[i].brightness;
-            mean_sum += (double) rates[i] * row[i].brightness;
-        }
+            sum += brightness;
+            mean_sum += (double) rates[i] * brightness;
+        });
+        m_rates = storage.close();
         if (chosen.empty())
             return false;
         m_points   = (uint32_t) ((end + 0xffffffffu) >> 32);
         m_count    = dr::opaque<UInt32D>((uint32_t) chosen.size());
         m_sum      = dr::opaque<FloatD>((float) sum);
         m_mean_sum = dr::opaque<FloatD>((float) mean_sum);
-        m_rates    = dr::load<mitsuba::DynamicBuffer<FloatD>>(rates.data(), count);
         m_chosen =
             dr::load<mitsuba::DynamicBuffer<UInt32D>>(chosen.data(), chosen.size());
         m_ends = dr::load<mitsuba::DynamicBuffer<UInt64D>>(ends.data(), ends.size());

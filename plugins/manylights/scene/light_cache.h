@@ -16,6 +16,7 @@
  * dr.freeze looks for the arrays that the function depends on.
  */
 
+#include "lamp_cache.h"
 #include "manylights/choice/parameters.h"
 #include "scene_arrays.h"
 #include "scene_fingerprint.h"
@@ -46,6 +47,7 @@ private:
         std::shared_ptr<SceneArrays<Float, Spectrum>> arrays;
         Fingerprint<Float> fingerprint;
         mitsuba::ref<Lights> lights;
+        LampCache<Float, Spectrum> lamps;
         /// How many calls of `render()` have checked these lights and go on
         uint32_t renderings = 0;
 
@@ -75,6 +77,14 @@ public:
         Rendering(const Rendering &) = delete;
 
         Lights &lights() const { return *m_entry->lights; }
+
+        /// Those that are small on the film of a sensor, null if there are none. For one thread
+        /// at a time
+        std::shared_ptr<const LampsInView<Float, Spectrum>>
+        lamps(const mitsuba::Sensor<Float, Spectrum> *sensor,
+              const mitsuba::Vector<uint32_t, 2> &size) const {
+            return m_entry->lamps.find(lights(), sensor, size);
+        }
 
     private:
         const LightCache &m_cache;
@@ -258,6 +268,7 @@ private:
                                                           : fingerprint.variables());
         // Until it has succeeded they are the lights of no scene
         entry.fingerprint = Fingerprint<Float>(0);
+        entry.lamps.clear();
         if (!entry.lights->refit(entry.scene, changed))
             return false;
         fingerprint.hold();
