@@ -72,11 +72,10 @@ template <typename Float> struct Reservoirs {
              Dealing dealing, Rng &rng) {
         Float w     = h / candidate.probability;
         Mask active = candidate.valid && w > 0.f && w < dr::Infinity<Float>;
-        UInt32 k =
-            dealing == Dealing::Greedy
-                ? lightest(count)
-                : dr::minimum(UInt32(rng.template next_float<Float>() * (float) count),
-                              (uint32_t) count - 1u);
+        UInt32 k = dealing == Dealing::Greedy
+                       ? lightest(count)
+                       : min_of(UInt32(rng.template next_float<Float>() * (float) count),
+                                (uint32_t) count - 1u);
         Float total = read_slot<Float>(weight, k, count) + w;
         Mask take   = active && rng.template next_float<Float>() * total < w;
         write_slot<Float>(weight, k, total, count, active);
@@ -93,7 +92,7 @@ private:
         for (uint32_t k = 1; k < count; ++k) {
             Mask less = weight[k] < smallest;
             best      = dr::select(less, k, best);
-            smallest  = dr::minimum(smallest, weight[k]);
+            smallest  = min_of(smallest, weight[k]);
         }
         return best;
     }
@@ -120,7 +119,7 @@ Float selection_threshold(const Slots<Float> &targets, size_t count, uint32_t pi
             small += dr::select(big, 0.f, targets[i]);
             free -= dr::select(big, Float(1.f), 0.f);
         }
-        tau = dr::select(small > 0.f && free > 0.f, dr::minimum(tau, small / free), tau);
+        tau = dr::select(small > 0.f && free > 0.f, min_of(tau, small / free), tau);
     }
     return tau;
 }
@@ -138,7 +137,7 @@ Selected<Float> select_item(const Slots<Float> &targets, size_t count, const Flo
     Selected<Float> result{ 0u, Float(1.f), false };
     Float begin(0.f);
     for (uint32_t i = 0; i < count; ++i) {
-        Float end     = begin + dr::minimum(targets[i], tau);
+        Float end     = begin + min_of(targets[i], tau);
         auto here     = x >= begin && x < end;
         result.item   = dr::select(here, i, result.item);
         result.target = dr::select(here, targets[i], result.target);

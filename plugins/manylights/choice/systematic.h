@@ -67,7 +67,8 @@ template <typename Float> struct SystematicCursor {
                    Float(0.f),
                    rng.template next_float<Float>(),
                    visits };
-        d.x = dr::clip((k + offset - d.place.begin) / d.place.width, 0.f, kBelowOne);
+        d.x =
+            min_of(max_of((k + offset - d.place.begin) / d.place.width, 0.f), kBelowOne);
 
         // Descend to the leaf on which the point falls
         loop(
@@ -82,7 +83,7 @@ template <typename Float> struct SystematicCursor {
         Mask same =
             d.place.node == last_leaf; // two points on the same border, by rounding
         last_leaf = d.place.node;
-        return { d.place.node & ~kLeafBit, dr::minimum(1.f, d.place.width), !same,
+        return { d.place.node & ~kLeafBit, min_of(1.f, d.place.width), !same,
                  d.place.visibility };
     }
 
@@ -90,7 +91,7 @@ template <typename Float> struct SystematicCursor {
     static Float inclusion_probability(const TreeView<Float> &tree,
                                        const Receiver<Float> &at, const UInt32 &light,
                                        const Float &expected, const Mask &active) {
-        return dr::minimum(1.f, expected * leaf_probability(tree, at, light, active));
+        return min_of(1.f, expected * leaf_probability(tree, at, light, active));
     }
 
 private:
@@ -98,7 +99,7 @@ private:
 
     /// The grandchild of the root on which the point falls
     Place below_top(const TreeView<Float> &tree, const Receiver<Float> &at) const {
-        Float x = dr::minimum((k + offset) / expected, kBelowOne) * top.total();
+        Float x = min_of((k + offset) / expected, kBelowOne) * top.total();
         ChildChoice<Float> choice =
             choose_child<Float, kTopClusters>(top, tree.top.child, x);
         Place place{ choice.child, choice.begin * scale, choice.weight * scale,
@@ -120,7 +121,7 @@ private:
 
     /// First point at or beyond `end`, and at least one further than the current one
     Float next_point(const Float &end) const {
-        return dr::maximum(k + 1.f, dr::ceil(end - offset));
+        return max_of(k + 1.f, dr::ceil(end - offset));
     }
 
     template <typename Descent>
@@ -150,7 +151,7 @@ private:
            second point, x is uniform in it, so low-order digits may be added. */
         Mask single = s.place.width >= 1.f && child.width <= 1.f;
         Float y     = dr::fmadd(s.dither, 1.f / 256.f, s.x);
-        s.x         = dr::minimum(dr::select(single, y - dr::floor(y), s.x), kBelowOne);
+        s.x         = min_of(dr::select(single, y - dr::floor(y), s.x), kBelowOne);
         s.place     = child;
         s.visits += 1u;
     }

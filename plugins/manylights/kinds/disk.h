@@ -71,7 +71,7 @@ struct DiskLight {
         Vector3f w     = row.vector(0) - x,
                  a     = dr::Pi<Float> * dr::cross(row.vector(3), row.vector(6));
         return { w, .16f * dr::norm(a),
-                 dr::maximum(flat_intensity<Float>(a, w), least * dr::norm(a)) };
+                 max_of(flat_intensity<Float>(a, w), least * dr::norm(a)) };
     }
 
     template <typename Float>

@@ -137,7 +137,7 @@ LightPoint<Float> flat_point(const Row<Float> &row, const typename Row<Float>::P
 /// Intensity of a flat emitter of area vector `a` (length: area) seen along w
 template <typename Float, typename Vector3f>
 Float flat_intensity(const Vector3f &a, const Vector3f &w) {
-    return dr::maximum(-dr::dot(a, w), 0.f) * dr::rsqrt(dr::squared_norm(w) + 1e-30f);
+    return max_of(-dr::dot(a, w), 0.f) * dr::rsqrt(dr::squared_norm(w) + 1e-30f);
 }
 
 } // namespace manylights

@@ -4,6 +4,7 @@
 
 #include "light_row.h"
 #include "manylights/base/loop.h"
+#include "manylights/base/min_max.h"
 #include <mitsuba/core/vector.h>
 
 namespace manylights {

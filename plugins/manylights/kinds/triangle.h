@@ -92,8 +92,8 @@ struct TriangleLight {
                  w  = row.vector(0) - x + (e1 + e2) * (1.f / 3.f);
         Float front = flat_intensity<Float>(a, w), back = flat_intensity<Float>(-a, w);
         // Edge-on to a smooth triangle some normals may still face x: leave a floor
-        Float both = dr::maximum(front + back, .05f * dr::norm(a));
-        front      = dr::maximum(front, least * dr::norm(a));
+        Float both = max_of(front + back, .05f * dr::norm(a));
+        front      = max_of(front, least * dr::norm(a));
         return { w, .16f * dr::norm(a), dr::select(row.two_sided(), both, front) };
     }
 

@@ -46,7 +46,7 @@ Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet
     Float t = dr::dot(at.n, a.w);
     Float twice =
         twice_positive(Float(dr::select(at.transmits, dr::abs(t), t)), a.variance);
-    Float reflected = dr::maximum(.5f * twice * inv_d, kCosineFloor);
+    Float reflected = max_of(.5f * twice * inv_d, kCosineFloor);
     if (at.media)
         reflected = dr::select(at.in_medium, 1.f, reflected);
     if (at.lobes != Lobes::None) {

@@ -21,7 +21,7 @@ constexpr float kMasking = .5f;
 /// Masking of a lobe towards a direction with the cosine c
 template <typename Float, typename Value>
 Value masking(const Value &c, const Float &alpha2) {
-    return dr::minimum(c * ((1.f / kMasking) * dr::rsqrt(alpha2)), 1.f);
+    return min_of(c * ((1.f / kMasking) * dr::rsqrt(alpha2)), 1.f);
 }
 
 /// What an observer of a lobe has to know of a light or a cluster at w, of variance s^2
@@ -40,7 +40,7 @@ template <typename Value> struct LobeView {
 template <typename Float, typename Value>
 Value transmitted_lobe(const Receiver<Float> &at, const LobeView<Value> &view) {
     Value b      = dr::fmadd(view.spread2, 2.f, at.beta2),
-          chord2 = dr::maximum(dr::fnmadd(view.dot_through, 2.f, 2.f), 0.f),
+          chord2 = max_of(dr::fnmadd(view.dot_through, 2.f, 2.f), 0.f),
           c      = twice_positive(Value(-view.cos_o), view.spread2);
     return at.transmitted * masking(Value(.5f * c), at.alpha2) * b *
            dr::square(dr::rcp(b + chord2));
@@ -63,9 +63,9 @@ template <typename Float, typename Value>
 Value lobe(const Receiver<Float> &at, const LobeView<Value> &view, const Value &c) {
     Float cos_i   = dr::dot(at.n, at.wi);
     Value length2 = dr::fmadd(view.dot_wi, 2.f, 2.001f),
-          cos2    = dr::minimum(dr::square(view.cos_o + cos_i), length2);
+          cos2    = min_of(dr::square(view.cos_o + cos_i), length2);
     // All over |wi + w / e|^2: one division
-    Value a = dr::minimum(dr::fmadd(length2, at.alpha2, 2.f * view.spread2), length2);
+    Value a = min_of(dr::fmadd(length2, at.alpha2, 2.f * view.spread2), length2);
     Value r = dr::rcp(dr::fmadd(cos2, a - length2, dr::square(length2)));
     Value d = a * length2 * dr::square(length2 * r);
     if (at.lobes == Lobes::Reflected)

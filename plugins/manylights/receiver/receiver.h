@@ -3,6 +3,7 @@
 /// The shading point as the tree sees it, and how a medium attenuates light on its way there.
 
 #include "manylights/base/loop.h"
+#include "manylights/base/min_max.h"
 #include <mitsuba/core/vector.h>
 
 namespace manylights {
@@ -62,7 +63,7 @@ template <typename Float> struct Receiver : ReceiverTraits {
     ReceiverTraits &traits() { return *this; }
 
     /// The part of a segment that may receive much light: some mean free paths
-    Float nearby() const { return dr::minimum(length, 6.f / extinction); }
+    Float nearby() const { return min_of(length, 6.f / extinction); }
 };
 
 /// Smallest transmittance that is assumed: how far the medium extends is not known
@@ -71,14 +72,14 @@ constexpr float kTransmittanceFloor = .02f;
 /// exp(-extinction * distance), the largest plausible effect of a medium up to a light
 template <typename Float, typename Value>
 Value attenuation(const Receiver<Float> &at, const Value &distance) {
-    return dr::maximum(dr::exp(-distance * at.extinction), kTransmittanceFloor);
+    return max_of(dr::exp(-distance * at.extinction), kTransmittanceFloor);
 }
 
 /// c + sqrt(c^2 + s^2): 2 max(c, 0), smoothed by a variance s^2
 template <typename Value> Value twice_positive(const Value &c, const Value &variance) {
     // Below the horizon the root may be less than -c: CUDA's is approximate, and the square of
     // a tiny c is rounded to zero
-    return dr::maximum(c + dr::sqrt(dr::fmadd(c, c, variance)), 0.f);
+    return max_of(c + dr::sqrt(dr::fmadd(c, c, variance)), 0.f);
 }
 
 } // namespace manylights

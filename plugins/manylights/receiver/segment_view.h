@@ -16,7 +16,7 @@ template <typename Value, typename Float> struct SegmentView {
     SegmentView(const Value &along, const Value &norm2, const Value &variance,
                 const Float &length)
         : nearest(along), length(length) {
-        Value off2 = dr::maximum(dr::fnmadd(along, along, norm2), 0.f);
+        Value off2 = max_of(dr::fnmadd(along, along, norm2), 0.f);
         distance   = dr::sqrt(dr::fmadd(norm2, 1e-7f, off2 + variance) + 1e-30f);
     }
 

@@ -59,13 +59,13 @@ Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
     F4 r2 = dr::fmadd(c.axis[0], c.axis[0],
                       dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
     if (directions == Directions::Broad)
-        return dr::maximum(1.f + 2.f * o + .75f * (3.f * o * o - r2), kEmissionFloor);
+        return max_of(1.f + 2.f * o + .75f * (3.f * o * o - r2), kEmissionFloor);
     F4 inv_r = dr::rsqrt(r2 + 1e-8f),
        spread =
            (1.f - r2) * inv_r * dr::rcp(3.f - r2) + c.variance * dr::square(inv_norm),
-       k    = dr::rcp(dr::maximum(spread, kNarrowestBeam));
+       k    = dr::rcp(max_of(spread, kNarrowestBeam));
     F4 peak = 2.f * k * dr::rcp(1.f - dr::exp(-2.f * k));
-    return dr::maximum(peak * dr::exp(k * (o * inv_r - 1.f)), kEmissionFloor);
+    return max_of(peak * dr::exp(k * (o * inv_r - 1.f)), kEmissionFloor);
 }
 
 /**
