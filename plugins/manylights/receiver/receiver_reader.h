@@ -89,6 +89,19 @@ private:
             at.extinctions.entry(i) = dr::maximum(plain(sigma.entry(i)), at.extinction);
     }
 
+    /// Targets and a density
+    using Measured = dr::Array<FloatD, 3>;
+
+    /// f(BSDF, interaction, active), once for each BSDF of active lanes
+    template <typename F>
+    static Measured call_bsdf(const F &f, const BSDFPtr &bsdf,
+                              const SurfaceInteraction3f &si, Mask active) {
+        if constexpr (dr::is_jit_v<Float>)
+            return dr::dispatch(bsdf, f, si, active);
+        else
+            return f(bsdf, si, active);
+    }
+
     /**
      * The glossy lobe, for any BSDF that may have one: its value and density in the mirror direction, and its
      * value well off the lobe. A GGX lobe has the density 1 / (4 pi alpha^2 cos) at its peak.
@@ -102,23 +115,27 @@ private:
         if (dr::none_or<false>(active))
             return;
         dr::suspend_grad<Float> detached;
-        mitsuba::BSDFContext ctx;
-        Float cos_i = Frame3f::cos_theta(si.wi);
-        Vector3f mirror(-si.wi.x(), -si.wi.y(), si.wi.z());
-        // At 60 degrees from the normal and at a right angle to the plane of incidence
-        Float inv =
-            .866f * dr::rsqrt(dr::square(si.wi.x()) + dr::square(si.wi.y()) + 1e-12f);
-        Vector3f aside(-si.wi.y() * inv, si.wi.x() * inv, dr::mulsign(Float(.5f), cos_i));
-
-        auto [peak, density] = bsdf->eval_pdf(ctx, si, mirror, active);
-        Spectrum base        = bsdf->eval(ctx, si, aside, active);
-        FloatD cosine        = dr::maximum(dr::abs(plain(cos_i)), 1e-3f);
-        FloatD off = target(base) * 2.f, on = target(peak);
-        FloatD alpha2 =
-            dr::rcp(4.f * dr::Pi<FloatD> * cosine *
-                    dr::maximum(plain(density) - cosine * dr::InvPi<FloatD>, .05f));
-        MaskD glossy = plain(active);
-        at.alpha2    = dr::select(glossy, dr::clip(alpha2, 1e-5f, 1.f), 1.f);
+        // One call, in which all that both evaluations have in common is computed once
+        auto measured = call_bsdf(
+            [](const auto *b, const SurfaceInteraction3f &it, Mask on) {
+                mitsuba::BSDFContext ctx;
+                Vector3f mirror(-it.wi.x(), -it.wi.y(), it.wi.z());
+                // At 60 degrees from the normal, at a right angle to the plane of incidence
+                Float inv = .866f * dr::rsqrt(dr::square(it.wi.x()) +
+                                              dr::square(it.wi.y()) + 1e-12f);
+                Vector3f aside(-it.wi.y() * inv, it.wi.x() * inv,
+                               dr::mulsign(Float(.5f), Frame3f::cos_theta(it.wi)));
+                auto [peak, density] = b->eval_pdf(ctx, it, mirror, on);
+                Spectrum base        = b->eval(ctx, it, aside, on);
+                return Measured(target(peak), plain(density), target(base));
+            },
+            bsdf, si, active);
+        FloatD on = measured[0], density = measured[1], off = measured[2] * 2.f;
+        FloatD cosine = dr::maximum(dr::abs(plain(Frame3f::cos_theta(si.wi))), 1e-3f);
+        FloatD alpha2 = dr::rcp(4.f * dr::Pi<FloatD> * cosine *
+                                dr::maximum(density - cosine * dr::InvPi<FloatD>, .05f));
+        MaskD glossy  = plain(active);
+        at.alpha2     = dr::select(glossy, dr::clip(alpha2, 1e-5f, 1.f), 1.f);
         FloatD specular =
             dr::maximum(on - off * cosine, 0.f) * at.alpha2 / masking(cosine, at.alpha2);
         at.specular = dr::select(glossy, specular, 0.f);
