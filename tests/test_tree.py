@@ -423,17 +423,17 @@ def tree_with_wrong_flux(count, light, factor):
 def test_planted_wrong_frequencies_are_found():
     """Samples of a tree with one flux 30 % too high do not follow the right probabilities.
 
-    The light has about a tenth of the probability, 2,000 of the samples, whose standard deviation
-    is 42: the error is more than ten of these.
+    The light has about a twelfth of the probability, 3,200 of the samples, whose standard
+    deviation is 54: the error is more than ten of these.
     """
-    at = RECEIVERS["below"]
+    at, trials = RECEIVERS["below"], 2 * TRIALS
     right = probabilities(make_tree(*random_lights(200)), at)
     wrong = tree_with_wrong_flux(200, int(right.argmax()), 1.3)
-    counts = selection_counts(draw(wrong, at, 1.0, TRIALS), 200)
+    counts = selection_counts(draw(wrong, at, 1.0, trials), 200)
     with pytest.raises(AssertionError, match="chi-square"):
         tools.assert_frequencies(counts, right)
     with pytest.raises(AssertionError, match="frequencies differ"):
-        tools.assert_binomial(counts, TRIALS, right)
+        tools.assert_binomial(counts, trials, right)
 
 
 def test_expecting_very_many_candidates_gives_every_light():
@@ -666,6 +666,41 @@ def test_single_light():
         for lights, p in draw(tree, at, 1.0, 3):
             assert lights == [0]
             np.testing.assert_allclose(p, [1], rtol=rounding(tree))
+
+
+def row_of_lights(flux):
+    """Lights at equal distances on a line."""
+    mean = np.zeros((len(flux), 3))
+    mean[:, 0] = np.arange(len(flux))
+    return make_tree(mean, flux)
+
+
+def slots_of(tree):
+    """The children of each node: leaves have the highest bit, empty slots are 0."""
+    return np.frombuffer(tree.nodes, np.uint32).reshape(-1, 24)[:, 16:20]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 8, 9, 14, 15, 16])
+def test_few_equal_lights_have_the_fewest_nodes(count):
+    """On the fewest levels; with other numbers the halves of the binary tree do not fit."""
+    tree = row_of_lights(np.ones(count))
+    assert tree.node_count == math.ceil((count - 1) / 3)
+    assert tree.depth == 1 + (count > 4)
+
+
+def test_bright_lights_hang_high():
+    """One of sixteen that outshines the others hangs at the root, wherever it is."""
+    for bright in range(16):
+        flux = np.ones(16)
+        flux[bright] = 1e4
+        tree = row_of_lights(flux)
+        leaf = list(tree.order).index(bright) + 0x80000000
+        assert leaf in slots_of(tree)[0]
+
+
+def test_nodes_of_many_lights_are_full():
+    """Nodes of small subtrees are few: two of five lights, where four of nine would be full."""
+    assert make_tree(*random_lights(10000)).node_count < 0.42 * 10000
 
 
 def test_lengths_must_agree():

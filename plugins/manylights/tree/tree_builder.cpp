@@ -22,6 +22,8 @@ constexpr uint32_t kBins = 16;
 constexpr uint32_t kMaxCostDepth = 64;
 /// Subtrees of more lights are built by tasks of their own
 constexpr uint32_t kTaskLights = 1 << 14;
+/// Subtrees of no more lights get the wide nodes of the least price
+constexpr uint32_t kPackedLights = 16;
 
 /// Threads differ in what they do with denormals: the result must not
 float to_float(double x) { return std::abs(x) < (double) FLT_MIN ? 0.f : (float) x; }
@@ -134,7 +136,31 @@ struct Node {
     uint32_t middle;
     /// Wide nodes of this subtree, if one begins here
     uint32_t wide_count;
+    /// Least price of the wide nodes of a small subtree that fills at most 1, 2 or 3 slots
+    std::array<float, 3> price;
 };
+
+/// What of a subtree decides how its wide nodes are chosen; that of a leaf is 0
+struct Prices {
+    std::array<float, 3> left, right;
+
+    /// The least one if its halves together fill at most `slots`, and how many the left one
+    std::pair<float, uint32_t> open(uint32_t slots) const {
+        std::pair<float, uint32_t> best{ std::numeric_limits<float>::infinity(), 0 };
+        for (uint32_t i = 1; i < slots; ++i)
+            if (float sum = left[i - 1] + right[slots - i - 1]; sum < best.first)
+                best = { sum, i };
+        return best;
+    }
+};
+
+/// Prices of both halves of a subtree
+Prices halves_of(const Subtree &tree, uint32_t middle, const HostVector<Node> &nodes) {
+    auto of = [&](const Subtree &half) {
+        return half.is_leaf() ? std::array<float, 3>{} : nodes[half.node].price;
+    };
+    return { of(tree.left(middle)), of(tree.right(middle)) };
+}
 
 /// The cluster of one light
 Cluster leaf_cluster(const LightBounds &light) {
@@ -230,8 +256,21 @@ private:
         right_cluster = split(right, right_centroids, depth + 1);
         tasks.wait();
         Cluster c          = join(left_cluster, right_cluster);
-        m_nodes[tree.node] = { c.cost, c.flux, middle, 0 };
+        m_nodes[tree.node] = { c.cost, c.flux, middle, 0, prices(tree, middle, c.flux) };
         return c;
+    }
+
+    /**
+     * That of a wide node is how often descents come to it where lights are chosen by flux, and
+     * a little for itself: the memory that it takes pushes others out of caches.
+     */
+    std::array<float, 3> prices(const Subtree &tree, uint32_t middle, float flux) const {
+        if (tree.count() > kPackedLights)
+            return {};
+        Prices halves = halves_of(tree, middle, m_nodes);
+        float node    = flux + 1.f / (float) m_lights.size() + halves.open(4).first;
+        return { node, std::min(node, halves.open(2).first),
+                 std::min(node, halves.open(3).first) };
     }
 
     /// Two lights lie in the order of their coordinates, whatever the input's order was
@@ -471,8 +510,44 @@ private:
         node.axis[slot]    = pack_axis(leaf_cluster(light).axis);
     }
 
-    /// Replace the costliest interior entry by its two children until there are four
+    /// Replace the root of a wide node by its children, at most four; returns how many
     uint32_t open_children(std::array<Subtree, 4> &children) const {
+        Subtree root = children[0];
+        if (root.count() > kPackedLights)
+            return open_costliest(children);
+        if (root.is_leaf())
+            return 1;
+        uint32_t count = 0;
+        open(root, 4, children, count);
+        return count;
+    }
+
+    /// The way of the least price to fill at most so many slots with the halves of a subtree
+    void open(const Subtree &tree, uint32_t slots, std::array<Subtree, 4> &children,
+              uint32_t &count) const {
+        uint32_t middle = m_nodes[tree.node].middle;
+        uint32_t left   = halves_of(tree, middle, m_nodes).open(slots).second;
+        fill(tree.left(middle), left, children, count);
+        fill(tree.right(middle), slots - left, children, count);
+    }
+
+    /// The same with the subtree itself or its halves
+    void fill(const Subtree &tree, uint32_t slots, std::array<Subtree, 4> &children,
+              uint32_t &count) const {
+        bool whole = tree.is_leaf() || slots == 1;
+        if (!whole) {
+            const Node &node = m_nodes[tree.node];
+            whole =
+                node.price[0] <= halves_of(tree, node.middle, m_nodes).open(slots).first;
+        }
+        if (whole)
+            children[count++] = tree;
+        else
+            open(tree, slots, children, count);
+    }
+
+    /// Replace the costliest interior entry by its two children until there are four
+    uint32_t open_costliest(std::array<Subtree, 4> &children) const {
         uint32_t count = 1;
         while (count < 4) {
             int worst = -1;
@@ -494,10 +569,11 @@ private:
         return count;
     }
 
-    /// By cost; coincident lights cost nothing and are opened by flux
+    /// By cost, and by how often descents come there; coincident lights cost nothing
     bool costlier(const Subtree &a, const Subtree &b) const {
         const Node &x = m_nodes[a.node], &y = m_nodes[b.node];
-        return x.cost != y.cost ? x.cost > y.cost : x.flux > y.flux;
+        double p = (double) x.cost * x.flux, q = (double) y.cost * y.flux;
+        return p != q ? p > q : x.flux > y.flux;
     }
 
     const HostVector<LightBounds> &m_lights;
