@@ -58,7 +58,7 @@ test: $(INSTALLED)  ## Run the quick tests
 
 .PHONY: test-slow
 test-slow: $(INSTALLED)  ## Run the long tests, mostly statistics over many renders
-	$(BIN)/python -m pytest $(IN_PARALLEL) -m slow $(ARGS)
+	MANYLIGHTS_TEST_OPTIMIZED=1 $(BIN)/python -m pytest $(IN_PARALLEL) -m slow $(ARGS)
 
 # Other seeds and variants: make soak ARGS="2000 --seed 50000 --variant llvm_ad_rgb"
 .PHONY: soak

@@ -11,7 +11,9 @@ import mitsuba as mi
 import pytest
 from manylights.loading import has_backend
 
-from tests import statistics_tools
+from tests import quick_kernels, statistics_tools
+
+quick_kernels.use()
 
 # Processes of tests share the cores. Mitsuba does not read images with a single thread.
 if statistics_tools.THREADS is not None:

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests import light_scenes, path_scenes
+from tests import light_scenes, path_scenes, quick_kernels
 
 pytestmark = pytest.mark.usefixtures("plugin")
 
@@ -103,8 +103,8 @@ def test_repeated_rendering_of_one_scene_is_equal(variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
-def test_image_does_not_depend_on_the_process(variant):
-    """A new process renders the same bits, of surfaces and of fog."""
+def test_image_does_not_depend_on_the_process(variant, tmp_path):
+    """A new process, whose kernels are optimized, renders the same bits, of surfaces and of fog."""
     script = (
         "import mitsuba, manylights\n"
         f"mitsuba.set_variant({variant!r})\n"
@@ -113,7 +113,12 @@ def test_image_does_not_depend_on_the_process(variant):
     )
     folder = Path(__file__).parents[1]
     process = subprocess.run(
-        [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, check=False
+        [sys.executable, "-c", script],
+        cwd=folder,
+        env=quick_kernels.optimized_environment(tmp_path),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert process.returncode == 0, process.stderr
     expected = [digest(rendered("resampled_tree")), digest(rendered_fog())]
