@@ -74,6 +74,16 @@ def scalar():
     return require_variant("scalar_rgb")
 
 
+@pytest.fixture
+def own_threads():
+    """Render with this process's share of the cores: threads without work keep a core busy.
+
+    For tests that read and write no OpenEXR files, which Mitsuba never ends with a single thread.
+    """
+    with statistics_tools.thread_count(statistics_tools.THREADS):
+        yield
+
+
 @pytest.fixture(scope="session")
 def plugin():
     """The package manylights; importing it makes its plugins known to Mitsuba."""

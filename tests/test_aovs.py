@@ -12,7 +12,7 @@ from manylights.output import channels, exr
 
 from tests.conftest import require_variant
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
 PLUGINS = ("manylights_direct", "manylights_volpath")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from manylights import scenes
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 both_plugins = pytest.mark.parametrize("plugin", ["manylights_direct", "manylights_volpath"])

@@ -11,7 +11,7 @@ import pytest
 
 from tests import light_scenes, path_scenes, quick_kernels
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
 METHODS = ["resampled_tree", "talk", "adaptive_splitting"]

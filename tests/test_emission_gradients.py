@@ -14,7 +14,7 @@ from tests import statistics_tools as tools
 from tests.conftest import require_variant
 from tests.test_path_gradients import derivative
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 SEEDS = 12
 DIRECT = {"type": "manylights_direct"}

@@ -12,7 +12,7 @@ import pytest
 from tests import statistics_tools as tools
 from tests.conftest import require_variant
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
 INTEGRATORS = ["manylights_direct", "manylights_volpath"]

@@ -10,7 +10,7 @@ import pytest
 from tests import statistics_tools as tools
 from tests.light_scenes import rgb, transform
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 

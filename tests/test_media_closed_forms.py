@@ -13,7 +13,7 @@ from tests import statistics_tools as tools
 from tests.path_references import light_tree, quick_and_slow
 from tests.test_path_closed_forms import assert_exact, both_variants, images_of
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 NULL = {"type": "null"}
 GRIDS = ("homogeneous", "heterogeneous")

@@ -28,7 +28,7 @@ from tests.example_tools import (
 from tests.scene_strategies import FOGS, Seeded, any_scene, lit_patch, strategy, wide_lamps
 from tests.soak import Children, check, variant_arguments
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 
 LIMIT = 60

@@ -17,7 +17,7 @@ from tests.path_references import METHODS, PARAMETERS, light_tree, parameter_id,
 from tests.path_scenes import homogeneous, rgb
 from tests.references import ERROR, planned_images
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 llvm_first = pytest.mark.parametrize(

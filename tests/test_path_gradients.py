@@ -21,7 +21,7 @@ from tests.path_references import light_tree
 from tests.path_scenes import homogeneous
 from tests.references import set_power_weights
 
-pytestmark = pytest.mark.usefixtures("plugin", "llvm")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads", "llvm")
 
 SEEDS = 24
 STEP = 0.05

@@ -27,7 +27,7 @@ from tests.path_references import (
 from tests.references import ERROR, planned_images, reference_variant, set_power_weights
 from tests.test_determinism import digest
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 llvm_first = pytest.mark.parametrize(

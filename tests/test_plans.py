@@ -9,7 +9,7 @@ from scipy import stats
 from tests.integrator_entries import ALL, REST, TRAIN, read, write
 from tests.statistics_tools import SIGNIFICANCE
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
 SIZE = {"width": 144, "height": 120}

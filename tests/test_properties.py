@@ -24,7 +24,7 @@ core = pytest.importorskip(
     "manylights._core", reason="manylights._core was not built: it needs Python.h (python3-dev)"
 )
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 EPSILON = float(np.finfo(np.float32).eps)
 SMALLEST = float(np.finfo(np.float32).tiny)

@@ -10,7 +10,7 @@ from tests import statistics_tools as tools
 from tests.light_scenes import rgb, transform
 from tests.test_path_gradients import full_text
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 

@@ -26,7 +26,7 @@ from tests import light_scenes
 from tests import statistics_tools as tools
 from tests.references import planned_images
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 

@@ -17,7 +17,7 @@ from scipy import stats
 from tests.conftest import require_variant
 from tests.statistics_tools import SIGNIFICANCE, assert_same_mean, render_seeds, sidak, welch
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 #: Requests of `draw`: a number, two pairs, and a number again.
 REQUESTS = "1221"

@@ -16,7 +16,7 @@ from manylights import scenes
 
 from tests import light_scenes
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 both_plugins = pytest.mark.parametrize("plugin_name", ["manylights_direct", "manylights_volpath"])

@@ -14,7 +14,7 @@ from tests import light_scenes
 from tests import statistics_tools as tools
 from tests.light_scenes import area, diffuse, transform
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 RGB = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 """Variants in which a texel is what arrives."""

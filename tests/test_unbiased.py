@@ -16,7 +16,7 @@ from tests.conftest import require_variant
 from tests.path_references import quick_and_slow
 from tests.references import ERROR, planned_images, reference_images, reference_variant
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 INFINITY = float("inf")
 

@@ -7,7 +7,7 @@ import pytest
 from tests import light_scenes
 from tests.light_scenes import rgb
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 FACTORS = (1e-25, 1e-21, 1e-18, 1e20, 1e25)
 CASES = {

@@ -9,7 +9,7 @@ from tests import statistics_tools as tools
 from tests.light_scenes import area, rgb, transform
 from tests.test_bad_input import warnings  # noqa: F401
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
 

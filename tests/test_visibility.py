@@ -14,7 +14,7 @@ from tests import statistics_tools as tools
 from tests.path_references import quick_and_slow
 from tests.statistics_tools import SIGNIFICANCE
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
 INTEGRATORS = {

@@ -14,7 +14,7 @@ from tests.references import reference_variant
 from tests.stability import samples
 from tests.stability.cases import CASES, QUICK, units
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 
 def assert_mean(name, variant, images):

@@ -19,7 +19,7 @@ from tests.stability import samples
 from tests.stability.cases import CASES, QUICK
 from tests.statistics_tools import SIGNIFICANCE
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 RARE = 1e-4
 REFERENCE_SEEDS = 2

@@ -24,7 +24,7 @@ from scipy import stats
 
 from tests import statistics_tools as tools
 
-pytestmark = pytest.mark.usefixtures("plugin")
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 COLUMNS, ROWS, SEEDS, REACH = 4096, 64, 32, 6
 
