@@ -237,7 +237,7 @@ def test_gradients_of_single_scattering():
 
     scene = closed_forms.fog_alone(camera, lights, sigma_t=extinction, albedo=albedo)
     keys = ["sensor.medium.albedo.value.value", "sensor.medium.sigma_t.value.value"]
-    found = automatic(scene, keys, light_tree(max_depth=2), 2048, range(SEEDS))
+    found = automatic(scene, keys, light_tree(max_depth=2), 64, range(SEEDS))
     exact = [np.reshape(image(np.array(extinction)).mean(), (1, 1, 1, 1))]
     exact.append(exact_derivative(image, extinction))
     exact = np.concatenate(exact, axis=-1)
