@@ -96,7 +96,7 @@ bench-quick: $(INSTALLED)  ## The same on a few small scenes (5 minutes)
 
 .PHONY: microbench
 microbench: $(INSTALLED) $(VENV)/.dev-tools  ## Time building, traversal and resampling alone (a minute) into microbench.json
-	$(BIN)/python -m pytest tests/bench_tree.py --benchmark-json=microbench.json $(ARGS)
+	MANYLIGHTS_TEST_OPTIMIZED=1 $(BIN)/python -m pytest tests/bench_tree.py --benchmark-json=microbench.json $(ARGS)
 
 # All anew, in seconds: Sphinx does not see that a parser or the list of pages has changed.
 .PHONY: docs
@@ -117,7 +117,7 @@ format: $(VENV)/.dev-tools  ## Rewrite the sources in the style that lint checks
 
 .PHONY: clean
 clean:  ## Delete everything that was built, .venv too
-	rm -rf build dist $(VENV) .pytest_cache .ruff_cache .hypothesis demo.exr demo.png bench bench-quick microbench.json
+	rm -rf build dist $(VENV) .cache .pytest_cache .ruff_cache .hypothesis demo.exr demo.png bench bench-quick microbench.json
 	find python tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip 25.1 is the first that can install the dependency groups of pyproject.toml.

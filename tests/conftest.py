@@ -11,7 +11,7 @@ import mitsuba as mi
 import pytest
 from manylights.loading import has_backend
 
-from tests import quick_kernels, statistics_tools
+from tests import quick_kernels, shared_results, statistics_tools
 
 quick_kernels.use()
 
@@ -27,6 +27,18 @@ BACKEND = os.environ.get("MANYLIGHTS_TEST_BACKEND", "llvm")
 
 NO_INFINITY = "OptiX finds no surface at all in a scene with a vertex at infinity"
 """Why a test is skipped in CUDA variants."""
+
+
+def pytest_configure(config):
+    """Before the processes of a parallel run start, which have a `workerinput`."""
+    if not hasattr(config, "workerinput"):
+        shared_results.begin()
+
+
+def pytest_unconfigure(config):
+    """After they have ended."""
+    if not hasattr(config, "workerinput"):
+        shared_results.end()
 
 
 def require_variant(name):

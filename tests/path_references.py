@@ -8,13 +8,12 @@ spectra, and kept for the rest of the run.
 
 from __future__ import annotations
 
-import functools
-
 import mitsuba as mi
 import pytest
 
 from tests import path_scenes
 from tests.references import ERROR, planned_images, set_power_weights
+from tests.shared_results import shared
 
 INTEGRATOR = "manylights_volpath"
 """The plugin that all tests of path tracing are about."""
@@ -86,7 +85,7 @@ def plugin_images(name, sensor=0, **parameters):
     return planned_images(scene, integrator, error, first_seed=0, sensor=sensor)
 
 
-@functools.cache
+@shared
 def known_images(name, variant, sensor=0, **parameters):
     """Images of Mitsuba's integrator, rendered in `variant`; restores the current one."""
     before = mi.variant()

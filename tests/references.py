@@ -6,12 +6,10 @@
 - `bsdf`: BSDF sampling alone, for emitters that Mitsuba samples wrongly.
 
 References are rendered in an LLVM variant where there is one, since it is much faster; the
-expectation is that of the scalar variant. They are kept for the rest of the run.
+expectation is that of the scalar variant. All processes of a run share them.
 """
 
 from __future__ import annotations
-
-import functools
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +18,7 @@ from manylights.loading import has_backend
 
 from tests import light_scenes
 from tests import statistics_tools as tools
+from tests.shared_results import shared
 
 SEEDS = 24
 """Renderings of the integrator under test: in JIT variants each records its kernels again."""
@@ -191,7 +190,7 @@ def make_reference(kind, bsdf_samples=1, hide_emitters=False):
     )
 
 
-@functools.cache
+@shared
 def reference_images(name, kind, variant, bsdf_samples=1, hide_emitters=False):
     """Images (seeds, height, width, channels) of the scene `name`; restores the variant."""
     before = mi.variant()

@@ -10,7 +10,6 @@ all lights change by the same power of two.
 """
 
 import contextlib
-import functools
 import gc
 import re
 import subprocess
@@ -27,6 +26,7 @@ import pytest
 from tests import light_scenes
 from tests import statistics_tools as tools
 from tests.references import planned_images, reference_variant
+from tests.shared_results import shared
 
 pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
@@ -226,7 +226,7 @@ def load(name):
     return mi.load_dict(CHANGES[name][0]())
 
 
-@functools.cache
+@shared
 def images_after(name, variant):
     """Images of the reference after a change, in a variant.
 
@@ -328,7 +328,7 @@ def test_twice_as_bright(variant, kind):
     assert not np.array_equal(before, image(scene, integrator))
 
 
-@functools.cache
+@shared
 def images_of_brighter(kind, variant):
     """Images of the reference in a variant, where half of the lights are thirty times as bright."""
     with in_variant(variant):

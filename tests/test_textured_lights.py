@@ -5,8 +5,6 @@ Mitsuba's own light sampling is no reference: it is wrong for textured spheres, 
 rectangles that are scaled, mirrored or sheared.
 """
 
-import functools
-
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from scipy import stats
 from tests import light_scenes
 from tests import statistics_tools as tools
 from tests.light_scenes import area, diffuse, transform
+from tests.shared_results import shared
 
 pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
@@ -234,7 +233,7 @@ def test_texture_of_one_colour_is_that_colour(variant, kind):
         np.testing.assert_allclose(values[1].mean(), values[0].mean(), rtol=2e-3)
 
 
-@functools.cache
+@shared
 def reflected_patterns(kind):
     """What the floor's origin reflects of a light at each place with the pattern as its texture."""
     texels = pattern()

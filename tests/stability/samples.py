@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-
 import mitsuba as mi
 import numpy as np
 
 from tests import closed_form
 from tests import statistics_tools as tools
 from tests.references import ERROR, make_reference, planned_images, set_power_weights
+from tests.shared_results import shared
 from tests.stability.cases import CASES
 
 TAIL_SIZE, TAIL_SEEDS = 256, 16
@@ -81,7 +80,7 @@ def closed_form_light(light, centre):
     )
 
 
-@functools.cache
+@shared
 def reference_images(name, variant):
     """Images of the same mean: a closed form, or Mitsuba's emitters one by one, or `volpath`."""
     if CASES[name].plain:
