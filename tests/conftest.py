@@ -33,6 +33,9 @@ def pytest_configure(config):
     """Before the processes of a parallel run start, which have a `workerinput`."""
     if not hasattr(config, "workerinput"):
         shared_results.begin()
+        # Threads of FLIP and of numpy keep cores busy while they wait, too
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
 
 
 def pytest_unconfigure(config):
