@@ -23,6 +23,13 @@ struct PathLimits {
 
 /// `max_depth` of paths that only roulette ends
 constexpr uint32_t kUnlimited = (uint32_t) -1;
+
+/// The number that roulette is played with, and what it does not see of the throughput:
+/// directions past lamps have a low weight, but are as likely to bring light as others
+template <typename Float> struct Roulette {
+    Float u = Float(0.f), factor = Float(1.f);
+};
+
 /// What a path carries from step to step
 template <typename Float, typename Spectrum> struct PathState {
     MI_IMPORT_TYPES(Sampler, Medium, MediumPtr)

@@ -43,7 +43,7 @@ public:
           m_segments(media.homogeneous && media.scattering),
           m_sees_lights(lights.can_be_hit() || scene->environment() != nullptr),
           m_flights(m_direct.media(), m_limits, m_segments),
-          m_scattering(m_limits, m_segments) {}
+          m_scattering(m_limits, m_segments, lights.tree()) {}
 
     /// Radiance along a ray from the camera, and whether it met anything. Light of groups is
     /// added to their sums.
@@ -111,8 +111,7 @@ private:
             m_direct.prepare(si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
                              m_media ? surface || piece.inside.here : surface);
         add_direct_light(s, vertex, piece, surface && !piece.hidden);
-        Float roulette = scatter(s, vertex, piece);
-        play_roulette(s, roulette);
+        play_roulette(s, scatter(s, vertex, piece));
         intersect(s, /* coherent = */ false);
         if (m_media)
             start_at(s, si.p, !piece.scattered);
@@ -215,12 +214,12 @@ private:
     // ----------------------------------------------------------------------- Scattering
 
     /// Continue in a direction sampled from the BSDF or the phase function
-    /// Returns the number that Russian roulette is played with
-    Float scatter(State &s, const Vertex &vertex, const Piece &piece) const {
-        Float u1 = s.sampler->next_1d(s.active), roulette(0.f);
+    Roulette<Float> scatter(State &s, const Vertex &vertex, const Piece &piece) const {
+        Float u1 = s.sampler->next_1d(s.active);
+        Roulette<Float> roulette;
         // Drawn here: a vertex has eight numbers, and manylights_sobol has sequences of four
         if (m_limits.rr_depth < m_limits.max_depth)
-            roulette = s.sampler->next_1d(s.active);
+            roulette.u = s.sampler->next_1d(s.active);
         Point2f u2     = s.sampler->next_2d(s.active);
         Mask surface   = s.active && !piece.scattered;
         Direction next = m_media ? m_scattering.sample_either(s, vertex, piece, u1, u2)
@@ -230,16 +229,16 @@ private:
         if (m_media)
             s.throughput *= piece.weight;
         s.eta *= next.eta;
-        Mask counts = !next.null;
-        s.valid |= s.active && counts && !s.ended;
+        s.valid |= s.active && !next.null && !s.ended;
         // Where null surfaces are no vertices, what light sampling knows is left in place
-        remember(s, vertex, piece, next, m_media ? counts : Mask(true));
+        remember(s, vertex, piece, next, m_media ? !next.null : Mask(true));
         if (m_media) {
             s.active &= s.depth < m_limits.max_depth;
             s.medium =
                 m_direct.media().medium_beyond(vertex.si, s.medium, next.ray.d, surface);
         }
-        s.ray = next.ray;
+        roulette.factor = next.past_lamps;
+        s.ray           = next.ray;
         return roulette;
     }
 
@@ -287,12 +286,13 @@ private:
         return surface;
     }
 
-    void play_roulette(State &s, const Float &u) const {
+    void play_roulette(State &s, const Roulette<Float> &roulette) const {
         Float most = dr::max(mitsuba::unpolarized_spectrum(s.throughput));
         s.active &= most != 0.f;
-        Float go_on = dr::detach(dr::minimum(most * dr::square(s.eta), .95f));
-        Mask plays  = s.depth >= m_limits.rr_depth;
-        s.active &= !plays || u < go_on;
+        Float go_on =
+            dr::detach(dr::minimum(most * roulette.factor * dr::square(s.eta), .95f));
+        Mask plays = s.depth >= m_limits.rr_depth;
+        s.active &= !plays || roulette.u < go_on;
         dr::masked(s.throughput, plays) = s.throughput * dr::rcp(go_on);
     }
 
