@@ -228,6 +228,47 @@ def in_scattered(points, directions, lights, extinction, phase):
     return total
 
 
+def double_scatter_image(camera, lights, extinction, albedo, order=2, nodes=64):
+    """Expected image of light of points that fog of an isotropic phase function scatters twice.
+
+    Fog and camera are those of `single_scatter_image`. From a point at the distance D of the
+    light, the light that is scattered once arrives, with r1 and r2 its ways and u their sum, by
+    the integral over (r1 r2)^-2 in bipolar coordinates, 2 pi / D dr1 dr2 r1 r2.
+    """
+    directions = camera.directions(*film_grid(camera, order))
+    forward = normalized(np.subtract(camera.target, camera.origin))
+    start = NEAR_CLIP / (directions @ forward)
+    share, weights = np.polynomial.legendre.leggauss(nodes)
+    share, weights = (share + 1) / 2, weights / 2
+    total = np.zeros((*directions.shape[:-1], 3))
+    for channel, sigma in enumerate(np.broadcast_to(extinction, 3)):
+        scattering = sigma * np.broadcast_to(albedo, 3)[channel]
+        farthest = 20 / sigma
+        for s, w in zip(share, weights):
+            points = np.array(camera.origin) + (start + farthest * s**2)[..., None] * directions
+            weight = w * 2 * s * farthest * scattering * np.exp(-sigma * farthest * s**2)
+            for light in lights:
+                distance = np.linalg.norm(np.array(light.position) - points, axis=-1)
+                once = once_scattered(distance, sigma) * light.intensity[channel]
+                total[..., channel] += weight * scattering / (4 * np.pi) ** 2 * once
+    return pixel_means(camera, total, order)
+
+
+def once_scattered(distance, sigma, nodes=96):
+    """Integral of exp(-sigma (r1 + r2)) / (r1 r2)^2 over space, between two points.
+
+    It is 4 pi / D times that of exp(-sigma u) / u log((u + D) / (u - D)) over u > D.
+    """
+    share, weights = np.polynomial.legendre.leggauss(nodes)
+    share, weights = (share + 1) / 2, weights / 2
+    # u = D + x; the logarithm's pole at 0 is flat in the fourth root of x
+    x = (20 / sigma) * share**4
+    dx = weights * (80 / sigma) * share**3
+    u = distance[..., None] + x
+    values = np.exp(-sigma * u) / u * np.log((u + distance[..., None]) / x)
+    return 4 * np.pi / distance * (values @ dx)
+
+
 def scene_dict(camera, lights, albedo):
     """The same plane, camera and lights as a dictionary for `mi.load_dict`."""
     import mitsuba as mi

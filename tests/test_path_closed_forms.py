@@ -9,6 +9,7 @@ numpy (`closed_form`).
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import stats
 
 from tests import closed_form, path_scenes
 from tests import statistics_tools as tools
@@ -369,3 +370,48 @@ def test_furnace_does_not_depend_on_parameters(llvm, parameters, method):
     """Every setting with many bounces between emitters on all sides."""
     images = images_of(path_scenes.furnace(), **parameters, **method)
     assert_exact(images, path_scenes.furnace_radiance(-1), label=f"{parameters}, {method}")
+
+
+# --------------------------------------------------------------------------- scattering near lamps
+
+
+def lamps_beside_view(count=1):
+    """Points close to the line of sight, out of view."""
+    places = [(0.9, 0.0, 0.3), (-1.1, -0.6, 0.4), (0.2, 0.4, -1.2)]
+    return [closed_form.Light(place, (1.0, 0.7, 0.4)) for place in places[:count]]
+
+
+@both_variants
+@pytest.mark.parametrize("count", [1, 3])
+def test_scattering_twice_near_lamps(variant, count):
+    """Paths that pass close to points bring the light that they should, pixel by pixel."""
+    camera = closed_form.Camera((0, -3, 0), (0, 0, 0), (0, 0, 1), 8, 3, 2)
+    lights, albedo = lamps_beside_view(count), 0.9
+    isotropic = closed_form.Phase(closed_form.isotropic)
+    exact = closed_form.single_scatter_image(camera, lights, EXTINCTION, (albedo,) * 3, isotropic)
+    exact += closed_form.double_scatter_image(camera, lights, EXTINCTION, albedo)
+    scene = fog_alone(camera, lights, sigma_t=EXTINCTION, albedo=albedo)
+    assert_exact(images_of(scene, max_depth=3), exact, tile=1, label=f"{count} lamps, {variant}")
+
+
+def grows(errors, few, factor=1.5):
+    """True unless `errors` are significantly below `factor` times those of `few` samples."""
+    result = stats.ttest_ind(errors, factor * few, equal_var=False, alternative="less")
+    return result.pvalue > tools.SIGNIFICANCE
+
+
+def test_error_near_lamps_falls_with_samples(llvm):
+    """Squared errors times samples stay: with the phase function alone they grow without bound."""
+    camera = closed_form.Camera((0, -3, 0), (0, 0, 0), (0, 0, 1), 8, 6, 4)
+    lights, albedo = lamps_beside_view(), 0.9
+    isotropic = closed_form.Phase(closed_form.isotropic)
+    exact = closed_form.single_scatter_image(camera, lights, EXTINCTION, (albedo,) * 3, isotropic)
+    exact += closed_form.double_scatter_image(camera, lights, EXTINCTION, albedo)
+    scene = mi.load_dict(fog_alone(camera, lights, sigma_t=EXTINCTION, albedo=albedo))
+    errors = {}
+    for spp in (4, 64):
+        images = tools.render_seeds(scene, light_tree(max_depth=3), spp, range(64))
+        errors[spp] = spp * ((images / exact - 1) ** 2).mean(axis=(1, 2, 3))
+    assert not grows(errors[64], errors[4])
+    # As much as the phase function alone had them grow
+    assert grows(1.7 * errors[64], errors[4])
