@@ -8,10 +8,11 @@
  * of them follows the clusters at the top of the tree. With c the cosine of the angle to a
  * cluster and s its extent over its distance D,
  *
- *     p(w) = sum of P pdf(c),    P in proportion to flux / D * emission * exp(-D (sigma + 1 / L))
+ *     p(w) = sum of P pdf(c),    P in proportion to flux / D * exp(-sigma D) * emission * v
  *     pdf(c) = (sqrt(b + 1) + sqrt(b - 1)) / (8 pi sqrt(b - c)),    b = 1 + s^2 / 2
  *
- * where what is further away than the length L of the present segment is likely to be hidden.
+ * where v = exp(-(D / L)^2 / 2) guesses what is hidden, or out of the fog: what is further away
+ * than the present segment, of length L, is long. What was learnt is another factor.
  * The pole is there where a lamp has a cluster of its own. The sum over all clusters is a
  * closed form: nothing depends on which of them was chosen.
  */
@@ -44,6 +45,7 @@ public:
             F4 weight =
                 defensive_weights<Float>(tree.top.clusters[i].flux, h[i], importance);
             whole += sum_of<Float>(weight);
+            weight *= m_free[i];
             if (root)
                 weight *=
                     tree.top_factors(at, *root, UInt32((uint32_t) i), tree.top.node[i]);
@@ -52,7 +54,7 @@ public:
         m_visible = m_weights.total() / whole;
     }
 
-    /// What was learnt to arrive of the lamps' light, as a factor
+    /// Share of the lamps' light that is thought to get past what is between
     const Float &visible() const { return m_visible; }
 
     Vector3f sample(const Float &u1, const Point2f &u2) const {
@@ -111,16 +113,16 @@ private:
         m_axis[i][2] = wz * inv;
         m_spread[i] =
             dr::minimum(.5f * c.variance * inv * inv, kMostSpread) + kLeastSpread;
-        F4 result =
-            c.flux * inv_e * dr::exp(d2 * inv * -(at.extinction + dr::rcp(at.length)));
+        m_free[i] = dr::exp(d2 * (-.5f * dr::rcp(dr::square(at.length))));
+        F4 result = c.flux * inv_e * attenuation(at, F4(d2 * inv));
         if (tree.directions != Directions::All)
             result *= emission(c, wx, wy, wz, inv_e, tree.directions);
         return result;
     }
 
     ClusterWeights<Float, kTopClusters> m_weights;
-    /// Of each cluster: the unit vector to its centre, and b - 1
-    F4 m_axis[kTopNodes][3], m_spread[kTopNodes];
+    /// Of each cluster: the unit vector to its centre, b - 1, and how likely it is seen
+    F4 m_axis[kTopNodes][3], m_spread[kTopNodes], m_free[kTopNodes];
     Float m_visible;
 };
 

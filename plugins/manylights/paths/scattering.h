@@ -110,7 +110,7 @@ private:
         mitsuba::PhaseFunctionContext<Float, Spectrum> ctx(s.sampler);
         auto phase = phase_of(mei, active);
         LampDirections<FloatD> lamps(m_tree, piece.along, plain(mei.p));
-        Float share = share_of_lamps(s, piece, phase, active);
+        Float share = share_of_lamps(s, piece, phase, active) * Float(lamps.visible());
         Mask past   = active && u1 < share;
         Float v = dr::select(past, u1, u1 - share) / dr::select(past, share, 1.f - share);
         v       = dr::minimum(v, kBelowOne);
@@ -131,8 +131,7 @@ private:
 
     /**
      * How many directions follow lamps that are not hidden: none if the light of the next segment
-     * does not count, and half of them at most. Fewer where light comes from surfaces rather than
-     * from fog, by what this segment scatters; and few where droplets scatter forwards, since most
+     * does not count, half of them at most, and few where droplets scatter forwards, since most
      * lamps are then off the phase function's lobe.
      */
     template <typename Phase>
@@ -142,9 +141,8 @@ private:
         mitsuba::PhaseFunctionContext<Float, Spectrum> ctx(s.sampler);
         Mask counts = active && piece.segment && !m_limits.is_last(s.depth + 1u);
         Float peak  = std::get<1>(phase->eval_pdf(ctx, mei, -mei.wi, counts));
-        Float fog(1.f - dr::exp(-piece.along.extinction * piece.along.length));
-        Float wide = dr::rsqrt(dr::maximum(4.f * dr::Pi<Float> * peak, 1.f));
-        return dr::detach(dr::select(counts, .5f * fog * wide, 0.f));
+        Float wide  = dr::rsqrt(dr::maximum(4.f * dr::Pi<Float> * peak, 1.f));
+        return dr::detach(dr::select(counts, .5f * wide, 0.f));
     }
 
     Direction to_direction(const Piece &piece, const Ray3f &ray, const Spectrum &weight,
