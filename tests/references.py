@@ -100,9 +100,9 @@ def render_at_once(scene, integrator, spp, seeds, sensor=0):
 
     For integrators of Mitsuba and in Python, most of whose time goes into recording small renders.
     Each sample has random numbers of its own, so images are independent as those of seeds are. The
-    first seed of a wavefront stands for all.
+    first seed of a wavefront stands for all. Its film has a box filter: not for wider ones.
     """
-    if mi.variant().startswith("scalar"):
+    if mi.variant().startswith("scalar") or not has_independent_pixels(scene.sensors()[sensor]):
         return tools.render_seeds(scene, integrator, spp, seeds, sensor)
     sensor = scene.sensors()[sensor]
     width, height = sensor.film().crop_size()

@@ -30,7 +30,7 @@ METHODS = {
     "resampled_tree:splitting_rate=2": (0.8, 600.0),
     "resampled_tree:splitting_rate=4": (0.7, 1100.0),
     "resampled_tree:reservoirs=2": (2.0, 330.0),
-    "resampled_tree:reservoirs=16": (0.9, 520.0),
+    "resampled_tree:reservoirs=32": (0.9, 520.0),
     "resampled_tree:shadow_rays=1": (2.6, 260.0),
     "resampled_tree:shadow_rays=8": (0.8, 640.0),
 }

@@ -117,13 +117,13 @@ def test_a_render_says_how_it_was_made(tmp_path, capsys):
     assert attributes["manylights.samples"] == result.samples
     assert attributes["manylights.noise"] == pytest.approx(result.noise)
     assert exr.fact(attributes["manylights.seed"]) == 2**32 - 1
-    assert "shadow_rays = 4" in attributes["manylights.parameters"]
+    assert "shadow_rays = 16" in attributes["manylights.parameters"]
     for index, name in enumerate("RGB"):
         assert planes[name].dtype == np.float16
         assert (planes[f"variance.{name}"] == result.variance[..., index]).all()
     assert cli.main(["info", str(path)]) == 0
     told = capsys.readouterr().out
-    for text in ("16 x 12", "variance.R", "shadow_rays = 4", "scalar_rgb", "worldToNDC"):
+    for text in ("16 x 12", "variance.R", "shadow_rays = 16", "scalar_rgb", "worldToNDC"):
         assert text in told
 
 

@@ -161,9 +161,11 @@ def images_and_noises(scene, spp, seeds):
     return np.stack([result.image for result in results]), [result.noise for result in results]
 
 
-@pytest.mark.parametrize("name", ["many_bulbs", "interior", "points"])
-def test_noise_is_that_of_many_seeds(few_pilots, name):
-    images, noises = images_and_noises(loaded(name), 32, range(16))
+@pytest.mark.parametrize(
+    ("name", "width", "height"), [("many_bulbs", 40, 24), ("interior", 40, 24), ("points", 96, 64)]
+)
+def test_noise_is_that_of_many_seeds(few_pilots, name, width, height):
+    images, noises = images_and_noises(loaded(name, width, height), 32, range(16))
     mean = images.mean(axis=0)
     truth = noise.noise(mean, images.var(axis=0, ddof=1))
     assert np.all(np.abs(np.array(noises) / truth - 1.0) < 0.2), (truth, noises)
@@ -189,14 +191,15 @@ def test_noise_of_parts_of_one_sequence_is_too_high(few_pilots):
 def test_variance_is_that_of_the_image(few_pilots):
     """Its mean over the pixels, against half the squared differences of images of two seeds.
 
-    Without the noisiest 2 % of the pixels, whose few bright samples are most of the mean.
+    Without the noisiest tenth of the pixels, whose few bright samples are most of the mean; those
+    are seen in other images.
     """
-    scene = loaded("points")
+    scene = loaded("points", 64, 40)
     results = [manylights.render(scene, spp=32, seed=seed, until_noise=1e-9) for seed in range(32)]
     images = np.stack([result.image for result in results])
     assert results[0].variance.shape == images[0].shape
-    spread = images.var(axis=0)
-    chosen = spread <= np.quantile(spread, 0.98)
+    spread = np.var([manylights.render(scene, spp=32, seed=100 + s).image for s in range(8)], axis=0)
+    chosen = spread <= np.quantile(spread, 0.9)
     expected = (np.square(images[0::2] - images[1::2]) / 2)[:, chosen].mean(axis=1)
     found = np.stack([result.variance for result in results])[:, chosen].mean(axis=1)
     assert tools.welch(found, expected).p > tools.SIGNIFICANCE
@@ -276,10 +279,10 @@ def test_interrupted_targets_go_on_to_the_same_bits(monkeypatch, tmp_path, varia
 def test_command_writes_the_noise_into_the_file(few_pilots, tmp_path, capsys):
     out = tmp_path / "out.exr"
     arguments = ["render", str(SCENES / "points.xml"), "-o", str(out), "--variant", "scalar_rgb"]
-    arguments += ["-D", "resx=32", "-D", "resy=20", "--until-noise", "0.1", "--spp", "256"]
+    arguments += ["-D", "resx=32", "-D", "resy=20", "--until-noise", "0.05", "--spp", "256"]
     assert cli.main(arguments) == 0
     noise_in_file = mi.Bitmap(str(out)).metadata()["manylights.noise"]
-    assert 0.05 < noise_in_file < 0.15
+    assert 0.025 < noise_in_file < 0.075
     assert f"noise {noise_in_file:.3g}, wrote" in capsys.readouterr().err
 
 

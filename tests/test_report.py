@@ -182,7 +182,7 @@ def test_of_a_sweep_the_default_and_a_peer_s_best_are_shown(data):
 def test_sweeps_have_the_default_value(data):
     scene = next(scene for scene in data.scenes if scene.name == "city_10000")
     groups = grouping.sweeps(scene, "shadow_rays")
-    assert [[value for value, _ in group] for group in groups] == [[1, 4, 8]]
+    assert [[value for value, _ in group] for group in groups] == [[1, 8, 16]]
     rates = {group[0][1].method: group for group in grouping.sweeps(scene, "splitting_rate")}
     assert [value for value, _ in rates["resampled_tree"]] == [0, 1, 2, 4]
     assert [value for value, _ in rates["talk"]] == [1, 2, 4, 8]
@@ -199,12 +199,12 @@ def test_the_default_by_name_is_the_default():
     """Sweeps measure it once more; charts have it once."""
     points = [(1, 1.0, 1.0)]
     plain, better = series_of(points), [(1, 0.9, 1.0)]
-    named = series_of(better, shadow_rays=4)
+    named = series_of(better, shadow_rays=16)
     others = [series_of(points, shadow_rays=count) for count in (1, 8)]
     scene = scene_of(plain, named, *others)
     assert grouping.shown(scene) == [plain]
     (group,) = grouping.sweeps(scene, "shadow_rays")
-    assert group == [(1, others[0]), (4, named), (8, others[1])]
+    assert group == [(1, others[0]), (8, others[1]), (16, named)]
 
 
 def test_a_family_is_ordered_by_lights(data):

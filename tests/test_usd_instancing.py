@@ -329,8 +329,10 @@ def test_many_lamps_are_one_mesh_of_the_same_light(tmp_path, kind):
 def test_separate_lamps_have_their_radiance_for_each_face(tmp_path, load):
     """More than a thousand spheres with as many radiances become one mesh."""
     rng = np.random.default_rng(2)
-    # In one plane, where none hides another
-    places = rng.uniform(-20, 20, (1200, 3)) * (1, 1, 0) + (0, 0, 40)
+    # In one plane, each in a square of its own, where none hides another
+    x, y = np.meshgrid(np.linspace(-20, 20, 40), np.linspace(-20, 20, 30))
+    places = np.stack([x.ravel(), y.ravel(), np.full(x.size, 40.0)], axis=-1)
+    places += rng.uniform(-0.4, 0.4, places.shape) * (1, 1, 0)
     values = rng.uniform(1, 100, len(places))
     lights = ";".join(
         f'def SphereLight "light_{index}" {{;float inputs:radius = 0.1;'

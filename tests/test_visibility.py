@@ -278,13 +278,17 @@ def test_no_borders_of_cells_in_the_noise(llvm):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
-@pytest.mark.parametrize("rate", [1, 4])  # few candidates are all kept, many are resampled
-def test_what_is_expected(variant, rate):
+@pytest.mark.parametrize(
+    "parameters",  # candidates are all traced, resampled, or chosen from
+    [{}, {"splitting_rate": 4}, {"shadow_rays": 4}],
+    ids=["traced", "resampled", "chosen"],
+)
+def test_what_is_expected(variant, parameters):
     """What should arrive by what was learnt looks like what arrives, and unlike all the light."""
     scene = mi.load_dict(hidden_points())
 
     def channels(learn):
-        method = integrator(learn_visibility=learn, splitting_rate=rate, counts=True)
+        method = integrator(learn_visibility=learn, counts=True, **parameters)
         render(scene, method)
         image = render(scene, method, seed=1, spp=64)
         tiles = tools.tile_means(image[np.newaxis], 8)
@@ -357,7 +361,7 @@ def test_few_lights_need_no_visibility(variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
-@pytest.mark.parametrize("count", [12, 40])
+@pytest.mark.parametrize("count", [20, 40])
 def test_small_tables_learn(variant, count):
     """Dr.Jit copies small arrays for each thread, and then allows only one kind of sum."""
     scene = mi.load_dict(manylights.scenes.behind_wall(count, **size()))

@@ -104,18 +104,15 @@ private:
                 write_slot<FloatD>(kept.weight, s.slot, weight, m_strategy.slots, valid);
                 write_slot<FloatD>(kept.probability, s.slot, p, m_strategy.slots, valid);
                 // Evaluate its target, by which shadow rays are chosen
-                if (m_strategy.chooses) {
-                    FloatD g = light_target(vertex, candidate.light, p, s.slot, kept,
-                                            active && valid) *
-                               candidate.visibility;
-                    if (m_strategy.params.counts)
-                        s.expected +=
-                            expected_light(weight * g, candidate.visibility, valid);
-                    if (m_lights.groups().evens())
-                        g *= evening(candidate.light, active && valid);
-                    write_slot<FloatD>(kept.target, s.slot, weight * g, m_strategy.items,
-                                       valid);
-                }
+                FloatD g = light_target(vertex, candidate.light, p, s.slot, kept,
+                                        active && valid) *
+                           candidate.visibility;
+                if (m_strategy.params.counts)
+                    s.expected += expected_light(weight * g, candidate.visibility, valid);
+                if (m_lights.groups().evens())
+                    g *= evening(candidate.light, active && valid);
+                write_slot<FloatD>(kept.target, s.slot, weight * g, m_strategy.items,
+                                   valid);
                 s.slot += dr::select(valid, UInt32D(1), UInt32D(0));
             },
             "Direct light: candidates");
@@ -178,7 +175,7 @@ private:
         kept.probability = reservoirs.probability;
         for (size_t i = 0; i < m_strategy.slots; ++i)
             kept.weight[i] = reservoirs.weight[i] / reservoirs.importance[i];
-        if (!m_strategy.chooses)
+        if (!m_strategy.chooses && !m_strategy.params.counts)
             return kept;
 
         State state{ UInt32D(0), kept.target, FloatD(0.f) };
