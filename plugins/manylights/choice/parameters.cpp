@@ -122,7 +122,11 @@ SamplingParameters read_parameters(const Properties &props) {
 }
 
 SamplingParameters read_path_parameters(const Properties &props) {
-    return read(props, kVolpath);
+    SamplingParameters p = read(props, kVolpath);
+    int64_t max_depth    = props.get<int64_t>("max_depth", -1);
+    if (max_depth < 0 || max_depth > 2)
+        p.candidates_per_rate = kCandidatesPerRateOnPaths;
+    return p;
 }
 
 std::vector<std::string> count_channels(const SamplingParameters &p) {

@@ -19,8 +19,8 @@ namespace manylights {
 
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
 constexpr float kMaxExpectedCandidates = 1 << 14;
-/// K for a splitting rate of 1. Light that has been reflected is dimmer, and rays that lead to
-/// the vertices of a path cost as much as shadow rays: there, fewer pay.
+/// K for a splitting rate of 1, and for paths of several bounces. Light that has been reflected is
+/// dimmer, and rays that lead to the vertices of a path cost as much as shadow rays: fewer pay.
 constexpr float kCandidatesPerRate = 16.f, kCandidatesPerRateOnPaths = 4.f;
 
 /// What decides whether a node is split: the talk's two functions, or the variance
@@ -35,6 +35,7 @@ struct SamplingParameters {
     Method method;
     SplitFunction split_function;
     float splitting_rate;
+    float candidates_per_rate = kCandidatesPerRate;
     uint32_t reservoirs, shadow_rays, bsdf_samples;
     /// Are the candidates and the visited nodes counted, in film channels?
     bool counts;
@@ -44,8 +45,7 @@ struct SamplingParameters {
 
     /// Expected number of candidates K, at least one
     float expected_candidates() const {
-        float unit = plugin == kVolpath ? kCandidatesPerRateOnPaths : kCandidatesPerRate;
-        return std::max(1.f, unit * splitting_rate);
+        return std::max(1.f, candidates_per_rate * splitting_rate);
     }
     /// Upper limit of the number of candidates
     float most_candidates() const {
