@@ -24,8 +24,7 @@ Mitsuba's own emitters one by one (`test_cases.py`), the tail of the distributio
 exhaustive resampling (`test_fireflies.py`), the noise along a line of receivers
 (`test_noise_boundaries.py`). Nothing is clamped anywhere. This file is written by `python -m
 tests.stability.make_readme`, in llvm_ad_rgb, a million samples of one pixel each for the default
-and 131,072 for `exhaustive`, which has every light as a candidate and then chooses four shadow rays
-like the default.
+and 131,072 for `exhaustive`, which has every light as a candidate and resamples them to 16.
 
 - *Variance*: of a sample, over the squared mean; default / exhaustive.
 - *99.99 %*: that percentile of the samples over the median; default / exhaustive. A dash: the
