@@ -52,7 +52,7 @@ def test_distribution_of_samples(llvm, name):
 
 
 def test_fireflies_are_found(llvm):
-    """One descent of the tree where the default has eight does not pass."""
+    """One descent of the tree where the default has sixteen does not pass."""
     reference = samples.single_samples("spots-5", REFERENCE_SEEDS, method="exhaustive")
     values = samples.single_samples("spots-5", method="tree")
     with pytest.raises(AssertionError, match="allowed"):
