@@ -185,9 +185,9 @@ their last part is an id, too, and what follows :code:`#` tells lights of one pa
 :code:`RGBA_key.R`, :code:`RGBA_key.G`, :code:`RGBA_key.B` and so on, in the order of their names:
 all light that begins in the lamps of the group, from the same samples as the image, which is their
 sum up to rounding. They are red, green and blue in any film. Where visibility is learnt, the
-brightness of each group is, too, as the last entries of :code:`visibility.counts`: targets
-:math:`g_i` are then divided by its square root (1/32 at most), so that the noise of dim groups is
-about as large as that of bright ones in relation to their light.
+brightness of each group is, too, as the last entries of :code:`visibility.counts`. With fewer
+shadow rays than kept lights the targets :math:`g_i` are divided by its square root (1/32 at most),
+so that the noise of dim groups is about as large as that of bright ones in relation to their light.
 
 Emitters of all kinds are supported. Point and spot lights and area lights on meshes, spheres,
 disks and cylinders are evaluated without virtual function calls, so that kernels do not grow
