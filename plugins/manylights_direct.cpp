@@ -109,9 +109,9 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
    :math:`l`. With :math:`K = 16 \cdot` :code:`splitting_rate` points at equal distances,
    :math:`l` becomes a candidate with probability :math:`p_l = \min(1, K w_l)`;
 
-2. if there can be more than :math:`m` (:code:`reservoirs`), they are resampled with a heuristic :math:`H` of single lights to
-   :math:`m`; one that holds the sum of weights :math:`W` has the contribution weight
-   :math:`C = W / H`, in place of :math:`1 / p_l`;
+2. if there can be more than :math:`m` (:code:`reservoirs`), they are resampled with a heuristic
+   :math:`H` of single lights to :math:`m`; one that holds the sum of weights :math:`W` has the
+   contribution weight :math:`C = W / H`, in place of :math:`1 / p_l`;
 
 3. on each of these a point is sampled and :math:`F`, the product of BSDF, emission,
    geometry and MIS weight, is evaluated without visibility. With fewer than :math:`m` shadow
@@ -125,7 +125,8 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
     \qquad g_i = |C_i F_i|,
 
 where :math:`\tau` is the step of the systematic sampling that chose them (:math:`\tau = 0` if
-all are traced). The estimate is unbiased, whatever :math:`h` and :math:`H`. With at most :math:`m` lights there is no tree:
+all are traced). The estimate is unbiased, whatever :math:`h` and :math:`H`. With at most
+:math:`m` lights there is no tree:
 all of them are kept. Environment maps, suns and directional lights always take part in step
 3.
 
