@@ -126,9 +126,8 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
 
 where :math:`\tau` is the step of the systematic sampling that chose them (:math:`\tau = 0` if
 all are traced). The estimate is unbiased, whatever :math:`h` and :math:`H`. With at most
-:math:`m` lights there is no tree:
-all of them are kept. Environment maps, suns and directional lights always take part in step
-3.
+:math:`m` lights there is no tree: all of them are kept. Environment maps, suns and directional
+lights always take part in step 3.
 
 **It works well** wherever a few of many lights matter at each point, and the more so the more
 lights there are. **It works less well**
