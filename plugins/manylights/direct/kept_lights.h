@@ -108,7 +108,8 @@ private:
                                         active && valid) *
                            candidate.visibility;
                 if (m_strategy.params.counts)
-                    s.expected += expected_light(weight * g, candidate.visibility, valid);
+                    s.expected +=
+                        m_samples.expected(weight * g, candidate.visibility, valid);
                 if (m_lights.groups().evens())
                     g *= evening(candidate.light, active && valid);
                 write_slot<FloatD>(kept.target, s.slot, weight * g, m_strategy.items,
@@ -119,12 +120,6 @@ private:
         counts.add(state.slot, state.cursor.visits, active);
         counts.expected += state.expected;
         return std::move(state.kept);
-    }
-
-    /// For film channels: the light of a weighted target F f that should arrive, F f^2 = F v
-    FloatD expected_light(const FloatD &target, const FloatD &visibility,
-                          const MaskD &active) const {
-        return dr::select(active, target * visibility * m_lights.tree().unit, 0.f);
     }
 
     /// Stage 2: deal the candidates to m reservoirs
@@ -193,7 +188,7 @@ private:
                 target *= visibility;
                 if (m_strategy.params.counts)
                     s.expected +=
-                        expected_light(weight * target, visibility, weight > 0.f);
+                        m_samples.expected(weight * target, visibility, weight > 0.f);
                 if (m_lights.groups().evens())
                     target *=
                         evening(read_slot<UInt32D>(kept.light, s.slot, m_strategy.slots),

@@ -32,6 +32,7 @@ public:
     using Emission        = SceneEmission<Float, Spectrum>;
     using FloatD          = typename Lights::FloatD;
     using UInt32D         = typename Lights::UInt32D;
+    using MaskD           = typename Lights::MaskD;
     using Reader          = ReceiverReader<Float, Spectrum>;
     using Vertex          = manylights::Vertex<Float, Spectrum>;
     using Distances       = typename Vertex::Distances;
@@ -46,6 +47,12 @@ public:
     /// What values are compared by: in units of the scene's brightest light
     FloatD target(const Spectrum &value) const {
         return Reader::target(value, m_lights.tree().scale);
+    }
+
+    /// For film channels: the light of a weighted target F f that should arrive, F f^2 = F v
+    FloatD expected(const FloatD &target, const FloatD &visibility,
+                    const MaskD &active) const {
+        return dr::select(active, target * visibility * m_lights.tree().unit, 0.f);
     }
 
     /**

@@ -147,11 +147,9 @@ private:
                 s.result += arrives;
                 teach(vertex, candidate.light, sample, arrives, plain(valid));
                 if (m_strategy.params.counts)
-                    s.expected += dr::select(plain(valid),
-                                             m_samples.target(sample.unoccluded()) *
-                                                 dr::square(candidate.visibility) *
-                                                 m_lights.tree().unit,
-                                             0.f);
+                    s.expected += m_samples.expected(
+                        m_samples.target(sample.unoccluded()) * candidate.visibility,
+                        candidate.visibility, plain(valid));
                 if (s.groups.size() > 0)
                     light.add(s.groups, arrives, Float(1.f),
                               m_lights.groups().of_light(m_lights.tree(), candidate.light,
