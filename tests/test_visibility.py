@@ -24,6 +24,7 @@ INTEGRATORS = {
 #: Enough pixels to learn: JIT variants do so where recording a second pass pays. In scalar ones
 #: the size of blocks depends on the number of threads if there are few.
 SIZES = {"scalar": (96, 64), "llvm": (144, 120), "cuda": (960, 640)}
+SAMPLES = 8
 
 
 def size():
@@ -70,12 +71,12 @@ def integrator(kind="direct", **parameters):
     return mi.load_dict({name: value for name, value in props.items() if value is not None})
 
 
-def render(scene, method, seed=0, spp=32):
+def render(scene, method, seed=0, spp=SAMPLES):
     """An image as an array."""
     return np.array(mi.render(scene, integrator=method, seed=seed, spp=spp))
 
 
-def images(scene, method, seeds=range(12), spp=32):
+def images(scene, method, seeds=range(16), spp=SAMPLES):
     """Images of several seeds."""
     return tools.render_seeds(scene, method, spp, seeds)
 
@@ -86,7 +87,9 @@ REFERENCES = {
     "paths": {"splitting_rate": 6, "learn_visibility": False},
 }
 #: With every light at each point a sample takes long, and fewer have the same noise.
-REFERENCE_SAMPLES = {"direct": 8, "paths": 16}
+REFERENCE_SAMPLES = {"direct": 4, "paths": 8}
+#: A bias of 1.5 % would be found.
+SEEDS = {"direct": 16, "paths": 24}
 CASES = [f"{name}-{kind}" for name in SCENES for kind in INTEGRATORS]
 CASES.remove("fog-direct")  # it knows no media
 
@@ -98,8 +101,9 @@ def test_unbiased(variant, case):
     name, kind = case.split("-")
     scene = mi.load_dict(SCENES[name]())
     reference = integrator(kind, **REFERENCES[kind])
-    seeds = range(12)
-    expected = images(scene, reference, range(100, 112), REFERENCE_SAMPLES[kind])
+    seeds = range(SEEDS[kind])
+    others = range(100, 100 + SEEDS[kind])
+    expected = images(scene, reference, others, REFERENCE_SAMPLES[kind])
     learnt = images(scene, integrator(kind), seeds)
     tools.assert_same_mean(learnt, expected, label=f"{case}, learning")
     kept = integrator(kind, learn_visibility="keep")
@@ -111,7 +115,7 @@ def test_bias_is_noticed(llvm):
     """A bias of 2 % in the light that arrives fails the comparison above."""
     scene = mi.load_dict(hidden_points())
     learnt = images(scene, integrator())
-    plain = images(scene, integrator(learn_visibility=False), range(100, 112))
+    plain = images(scene, integrator(learn_visibility=False), range(100, 116))
     with pytest.raises(AssertionError):
         tools.assert_same_mean(1.02 * learnt, plain)
 
@@ -179,7 +183,7 @@ def test_all_seeds_take_the_same_kernels(llvm, kind, sampler, learns):
 
     def kernels(seed):
         dr.kernel_history_clear()
-        render(scene, method, seed, spp=25 if sampler == "orthogonal" else 16)
+        render(scene, method, seed, spp=9 if sampler == "orthogonal" else 4)
         return {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -210,10 +214,10 @@ def test_what_is_kept_is_used(variant):
     """A later image has less noise than the first, and depends on what was learnt."""
     scene = mi.load_dict(hidden_points())
     first, second = [], []
-    for seed in range(FEW):
+    for seed in range(12):
         kept = integrator(learn_visibility="keep")
-        first.append(render(scene, kept, seed))
-        second.append(render(scene, kept, seed + 100))
+        first.append(render(scene, kept, seed, spp=4))
+        second.append(render(scene, kept, seed + 100, spp=4))
     first, second = variances(np.stack(first)), variances(np.stack(second))
     test = stats.wilcoxon(second.ravel(), first.ravel(), alternative="less")
     assert test.pvalue < SIGNIFICANCE
@@ -270,7 +274,7 @@ def border_pvalue(noise):
 def test_no_borders_of_cells_in_the_noise(llvm):
     """Nothing changes there at once; 15 % more noise in every other cell would be found."""
     scene = mi.load_dict(floor_under_slats())
-    noise = images(scene, integrator(), range(16))[..., 1].var(axis=0, ddof=1)
+    noise = images(scene, integrator(), spp=4)[..., 1].var(axis=0, ddof=1)
     assert border_pvalue(noise) > SIGNIFICANCE
     x = 8.0 * (np.arange(noise.shape[1]) + 0.5) / noise.shape[1] - 4.0
     odd = np.floor(x / cell_sides(x)) % 2.0
@@ -290,7 +294,7 @@ def test_what_is_expected(variant, parameters):
     def channels(learn):
         method = integrator(learn_visibility=learn, counts=True, **parameters)
         render(scene, method)
-        image = render(scene, method, seed=1, spp=64)
+        image = render(scene, method, seed=1, spp=16)
         tiles = tools.tile_means(image[np.newaxis], 8)
         return tiles[..., :3].mean(axis=-1).ravel(), tiles[..., 5].ravel()
 
@@ -393,7 +397,7 @@ def test_gradients_are_those_without_learning(llvm):
         key = next(name for name, _ in params if name.endswith("reflectance.value"))
         dr.enable_grad(params[key])
         image = mi.render(
-            scene, params, integrator=integrator(learn_visibility=learn), spp=32, seed_grad=3
+            scene, params, integrator=integrator(learn_visibility=learn), spp=SAMPLES, seed_grad=3
         )
         dr.backward(dr.mean(image, axis=None))
         gradients.append(np.array(dr.grad(params[key])))
