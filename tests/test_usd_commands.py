@@ -175,6 +175,8 @@ def test_without_usd_core(stage):
 
 def test_bench_measures_a_stage(stage, tmp_path):
     """A stage is a scene like any other."""
+    settings = 'def RenderSettings "small"\n{\n    int2 resolution = (64, 36)\n}\n'
+    stage.write_text(stage.read_text() + settings)
     out = tmp_path / "measured"
     command = ["bench", str(stage), "--out", str(out), "--variant", "scalar_rgb", "--seeds", "2"]
     command += ["--spp", "1", "--methods", "resampled_tree", "--time-budget", "0.05"]
