@@ -6,14 +6,18 @@ import os
 import signal
 from pathlib import Path
 
+from tests import quick_kernels
+
+# Dr.Jit loads libLLVM when it is imported.
+quick_kernels.use()
+
+# ruff: noqa: E402
 import drjit as dr
 import mitsuba as mi
 import pytest
 from manylights.loading import has_backend
 
-from tests import quick_kernels, shared_results, statistics_tools
-
-quick_kernels.use()
+from tests import shared_results, statistics_tools
 
 # Processes of tests share the cores. Mitsuba does not read images with a single thread.
 if statistics_tools.THREADS is not None:
@@ -36,6 +40,29 @@ def pytest_configure(config):
         # Threads of FLIP and of numpy keep cores busy while they wait, too
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             os.environ.setdefault(name, "1")
+
+
+def pytest_collection_modifyitems(items):
+    """Bring the tests of a file in the order of their variants.
+
+    With each change to a JIT variant Mitsuba loads its integrators in Python again, which takes
+    as long as a short test. Scalar tests come last: their references are those of LLVM variants.
+    """
+    files = {item.path: place for place, item in enumerate(items)}
+    items.sort(key=lambda item: (files[item.path], last_if_scalar(variant_of(item))))
+
+
+def variant_of(item):
+    """The variant that a test runs in, '' if it is not known before."""
+    if hasattr(item, "callspec") and "variant" in item.callspec.params:
+        return str(item.callspec.params["variant"])
+    fixtures = {"llvm": "llvm_ad_rgb", "scalar": "scalar_rgb"}
+    return next((fixtures[name] for name in item.fixturenames if name in fixtures), "")
+
+
+def last_if_scalar(variant):
+    """A key to sort variants by."""
+    return variant == "" or variant.startswith("scalar"), variant
 
 
 def pytest_unconfigure(config):
