@@ -290,7 +290,7 @@ def alpha_images(name, integrator, first_seed, description=None):
     scene = description or path_scenes.SCENES[name]()
     scene["sensor"]["film"]["pixel_format"] = "rgba"
     seeds = range(first_seed, first_seed + 16)
-    return tools.render_seeds(mi.load_dict(scene), integrator, 129, seeds)[..., 3:]
+    return tools.render_seeds(mi.load_dict(scene), integrator, 65, seeds)[..., 3:]
 
 
 def assert_same_alpha(name, **parameters):
