@@ -45,7 +45,7 @@ METHODS = (
 MAX_DEPTH = 4
 """Default path depth of the tests: three bounces."""
 
-RARE = ("fog-not-spectral",)
+RARE = ("fog-not-spectral", *(f"phase-{name}" for name in path_scenes.PHASES))
 """A lamp next to a line of sight has rare bright samples, which the short pilots do not see."""
 
 

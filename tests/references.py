@@ -35,6 +35,12 @@ REFERENCE_SEEDS = 64
 PILOTS = 8
 """Short renderings that tell how many samples are needed."""
 
+LONG_PILOTS = 32
+"""As many where few pixels have nearly all of the variance of these."""
+
+FEW_DEGREES = 30
+"""Degrees of freedom of a variance that is not known well: its upper end is half more."""
+
 ERROR = {
     "uniform": 1.3e-3,
     "power": 1.3e-3,
@@ -73,14 +79,14 @@ def planned_images(scene, integrator, error, first_seed, sensor=0, known=False):
     count = REFERENCE_SEEDS if known else SEEDS
     if not known and mi.variant().startswith("scalar"):
         count, error = SCALAR_SEEDS, SCALAR_ERROR * error
-    pilot_spp = 9
+    pilot_spp, independent = 9, has_independent_pixels(scene.sensors()[sensor])
     pilot = render(scene, integrator, pilot_spp, range(first_seed, first_seed + PILOTS), sensor)
+    if not known and independent and tools.variance_of_pixel_sum(pilot)[1].min() < FEW_DEGREES:
+        more = range(first_seed + PILOTS, first_seed + LONG_PILOTS)
+        longer = render(scene, integrator, pilot_spp, more, sensor)
+        pilot = np.concatenate([pilot, longer])
     spp = tools.samples_for_precision(
-        pilot,
-        pilot_spp,
-        count,
-        error,
-        independent_pixels=has_independent_pixels(scene.sensors()[sensor]),
+        pilot, pilot_spp, count, error, independent_pixels=independent
     )
     seeds = range(first_seed + 1000, first_seed + 1000 + count)
     return render(scene, integrator, max(5, spp | 1), seeds, sensor)
