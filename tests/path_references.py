@@ -85,6 +85,20 @@ def plugin_images(name, sensor=0, **parameters):
     return planned_images(scene, integrator, error, first_seed=0, sensor=sensor)
 
 
+def weigh_emitters(name, scene):
+    """Set the weights with which Mitsuba's integrators choose emitters of the scene `name`.
+
+    Lamps that it must not choose are found by chance.
+    """
+    set_power_weights(scene)
+    for shape in scene.shapes() if name in path_scenes.CUT_LAMPS else ():
+        if shape.is_emitter():
+            parameters = mi.traverse(shape.emitter())
+            parameters["sampling_weight"] = 0.0
+            parameters.update()
+    scene.parameters_changed()
+
+
 @shared
 def known_images(name, variant, sensor=0, **parameters):
     """Images of Mitsuba's integrator, rendered in `variant`; restores the current one."""
@@ -92,7 +106,7 @@ def known_images(name, variant, sensor=0, **parameters):
     mi.set_variant(variant)
     try:
         scene = path_scenes.load(name)
-        set_power_weights(scene)
+        weigh_emitters(name, scene)
         integrator = known(name, **{"max_depth": depth_of(name), **parameters})
         error = ERROR["uniform"]
         return planned_images(scene, integrator, error, 100_000, sensor, known=True)

@@ -595,6 +595,9 @@ FOGS["smoke-sggx"] = lambda: fog(heterogeneous(phase=PHASES["sggx"](), scale=1.2
 SINGLE_SCATTERING = ("points-inside", "points-unbounded", "flat-flakes")
 """Scenes for `max_depth` 2: points in the medium, and what Mitsuba cannot sample."""
 
+CUT_LAMPS = ("nets", "thin-boundary")
+"""Scenes where borders of media cut lamps: Mitsuba's shadow rays lose 1 to 2 % of their light."""
+
 SCENES = {**SURFACES, **FOGS}
 
 

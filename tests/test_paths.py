@@ -23,8 +23,9 @@ from tests.path_references import (
     parameter_id,
     plugin_images,
     quick_and_slow,
+    weigh_emitters,
 )
-from tests.references import ERROR, planned_images, reference_variant, set_power_weights
+from tests.references import ERROR, planned_images, reference_variant
 from tests.test_determinism import digest
 
 pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
@@ -104,7 +105,7 @@ def assert_reference_agrees(name, other):
     """Compare the reference of a scene with another integrator of Mitsuba."""
     integrator = mi.load_dict({"type": other, "max_depth": depth_of(name)})
     scene = path_scenes.load(name)
-    set_power_weights(scene)
+    weigh_emitters(name, scene)
     images = planned_images(scene, integrator, ERROR["uniform"], 200_000, known=True)
     tools.assert_same_mean(images, known_images(name, mi.variant()), label=f"{name}, {other}")
 
