@@ -342,6 +342,25 @@ def test_numbers_of_samples(variant, spp):
     assert np.array_equal(image, plain) == too_few
 
 
+@pytest.mark.parametrize("samples", [2**17, 2**18])
+def test_many_materials_want_more_samples(llvm, samples):
+    """Recording a pass takes the longer the more BSDFs there are: about 96 are three times 32."""
+    description = hidden_points()
+    for i in range(94):
+        description[f"plate_{i}"] = {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([i, 0, -50]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": i / 100}},
+        }
+    scene = mi.load_dict(description)
+    width, height = SIZES["llvm"]
+    image, plain = (
+        render(scene, integrator(learn_visibility=learn), spp=samples // (width * height))
+        for learn in (True, False)
+    )
+    assert np.array_equal(image, plain) == (samples < 3 * 2**16)
+
+
 def test_few_samples_teach(scalar):
     """Two samples of each pixel have less noise with learning, and the same mean."""
     scene = mi.load_dict(hidden_points())

@@ -66,9 +66,9 @@ public:
     }
 
     /// The passes of a rendering that has no plan
-    PassPlan plan(const Lights &lights, const SamplerKind &sampler, uint32_t spp,
-                  uint64_t pixels) const {
-        if (m_frozen || !can_learn(lights) || (double) pixels * spp < kLeastTotal)
+    PassPlan plan(const Lights &lights, const Scene *scene, const SamplerKind &sampler,
+                  uint32_t spp, uint64_t pixels) const {
+        if (m_frozen || !can_learn(lights) || (double) pixels * spp < least_total(scene))
             return PassPlan::whole(spp);
         return PassPlan::learning(spp, pixels, !sampler.divides());
     }
@@ -130,9 +130,16 @@ private:
         m_lights = nullptr;
     }
 
-    /// With fewer samples, recording one more pass takes longer than it may gain
-    static constexpr double kLeastTotal =
-        dr::is_cuda_v<Float> ? 0x1p23 : (dr::is_llvm_v<Float> ? 0x1p16 : 0);
+    /// With fewer samples, recording two more passes takes longer than it may gain; a recording
+    /// takes longer with many materials and lamps
+    static double least_total(const Scene *scene) {
+        if constexpr (dr::is_jit_v<Float>)
+            return kLeastTotal * std::max(1., count_callables(scene) / kCallables);
+        else
+            return 0;
+    }
+    static constexpr double kLeastTotal = dr::is_cuda_v<Float> ? 0x1p23 : 0x1p16,
+                            kCallables  = 32;
 
     /// Go on from what the user has written
     void write_counts() {

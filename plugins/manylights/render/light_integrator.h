@@ -258,7 +258,7 @@ private:
         SamplerKind kind(sampler);
         bool job        = !m_plan.empty();
         uint64_t pixels = (uint64_t) size.x() * size.y();
-        PassPlan plan   = job ? m_plan : m_learning.plan(lights, kind, spp, pixels);
+        PassPlan plan = job ? m_plan : m_learning.plan(lights, scene, kind, spp, pixels);
         plan.check(spp);
         size_t channels = film->prepare(aov_names());
         log_start(size, spp, plan.size());
