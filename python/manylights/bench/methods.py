@@ -37,8 +37,8 @@ class About:
 #: All methods, in the order of charts. A new one of ours is added to ``integrators.METHODS``, too.
 ABOUT = {
     "resampled_tree": About(
-        "ours with its default settings: equidistant points descend the tree, the lights they "
-        "find are resampled",
+        "ours with its default settings: equidistant points descend the tree, and the lights they "
+        "find get shadow rays",
         "#D55E00",
         "o",
     ),
