@@ -68,20 +68,32 @@ soak: $(INSTALLED)  ## Render 10,000 random scenes in child processes: no crash,
 # Another build, beside the usual one. What it finds ends the process, so that its report must
 # not be kept by pytest; memory is not given back at once and cannot be watched. Tests of means
 # are left out: they render the scenes that test_robust.py renders, hundreds of times.
-SANITIZED       := build/sanitized
 SANITIZED_TESTS := $(addprefix tests/test_,tree.py resampling.py counts.py determinism.py \
                    scene_updates.py robust.py) -k "not memory and not mean"
 
-.PHONY: test-sanitized
-test-sanitized: $(INSTALLED)  ## Run tests with checks of memory access and undefined behaviour (GCC)
-	MANYLIGHTS_VARIANTS=scalar_rgb,scalar_spectral $(PIP) install --quiet --upgrade --no-deps \
-	  --no-build-isolation --target $(SANITIZED)/site -C build-dir=$(SANITIZED)/objects \
+# Into folder $(1), with more options $(2) of the compiler
+define test_sanitized
+	CXXFLAGS="$(2)" MANYLIGHTS_VARIANTS=scalar_rgb,scalar_spectral $(PIP) install --quiet --upgrade \
+	  --no-deps --no-build-isolation --target $(1)/site -C build-dir=$(1)/objects \
 	  -C cmake.build-type=RelWithDebInfo -C cmake.define.MANYLIGHTS_SANITIZE=ON .
 	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) \
 	  $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
-	  DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath $(SANITIZED)/site) \
+	  DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath $(1)/site) \
 	  $(BIN)/python -m pytest --capture=sys $(SANITIZED_TESTS) $(ARGS)
+endef
+
+.PHONY: test-sanitized
+test-sanitized: $(INSTALLED)  ## Run tests with checks of memory access and undefined behaviour (GCC)
+	$(call test_sanitized,build/sanitized)
+
+.PHONY: coverage
+coverage: $(INSTALLED) $(VENV)/.coverage-tools  ## Count the lines that tests run: Python (quick tests), C++ (test-sanitized)
+	$(BIN)/python -m pytest $(IN_PARALLEL) --cov --cov-report= $(ARGS)
+	$(BIN)/coverage report --skip-covered --sort=cover
+	find build/coverage -name '*.gcda' -delete 2>/dev/null || true
+	$(call test_sanitized,build/coverage,--coverage -fprofile-update=atomic)
+	$(BIN)/gcovr --root . --filter plugins/ --sort uncovered-percent build/coverage/objects
 
 # Without HOME nothing is taken from Dr.Jit's cache on disk: first renders compile.
 .PHONY: bench
@@ -125,6 +137,10 @@ $(VENV)/.created:
 	@PYTHON="$(PYTHON)" ext/missing-packages tools
 	@$(PYTHON) -m venv $(VENV) || $(PYTHON) -m virtualenv $(VENV) || { rm -rf $(VENV); exit 1; }
 	$(PIP) install --quiet --upgrade 'pip>=25.1'
+	@touch $@
+
+$(VENV)/.coverage-tools: pyproject.toml | $(VENV)/.created
+	$(PIP) install --quiet --group coverage
 	@touch $@
 
 $(VENV)/.dev-tools: pyproject.toml | $(VENV)/.created
