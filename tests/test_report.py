@@ -130,6 +130,20 @@ def test_gain_is_the_ratio_of_error_times_time():
     assert ratio.low < 6 < ratio.high < 7
 
 
+def test_gain_compares_errors_after_the_same_time():
+    """A series that falls faster than 1 / time gains nothing by having been measured for longer."""
+    peer = series_of([(1, 1.0, 1.0), (4, 4.0, 0.125), (16, 16.0, 0.125**2)])
+    for seconds in (1.0, 2.0, 4.0, 10.0, 16.0):
+        ours = series_of([(9, seconds, 0.1)])
+        ratio = statistics.gain(peer, ours, scene_of(ours, peer))
+        assert ratio.value == pytest.approx(seconds**-1.5 / 0.1)
+        assert ratio.low < ratio.value < ratio.high
+    for seconds, error in ((0.5, 2.0), (32.0, 0.125**2 / 2)):
+        ours = series_of([(9, seconds, 0.1)])
+        ratio = statistics.gain(peer, ours, scene_of(ours, peer))
+        assert ratio.value == pytest.approx(error / 0.1)
+
+
 def test_points_at_the_error_of_the_reference_are_not_used():
     series = series_of([(1, 1.0, 1.0), (4, 4.0, 0.25), (16, 16.0, 0.11)])
     scene = scene_of(series, error=0.02)

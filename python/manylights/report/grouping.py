@@ -8,7 +8,7 @@ from typing import Any
 from manylights.bench.methods import SWEPT
 from manylights.bench.records import Results, Scene, Series
 from manylights.loading.integrators import value_text
-from manylights.report.statistics import cost
+from manylights.report.statistics import cost, gain
 
 #: A sweep with fewer values is no curve.
 MIN_SWEEP = 3
@@ -30,8 +30,15 @@ def ours(scene: Scene) -> Series | None:
 
 
 def best(candidates: list[Series], scene: Scene) -> Series:
-    """The series with the lowest error times time."""
-    return min(candidates, key=lambda series: cost(series, scene).value)
+    """The series with the lowest error after the same time as ours, if there is one."""
+    reference = ours(scene)
+
+    def price(series: Series) -> float:
+        if reference is None:
+            return cost(series, scene).value
+        return gain(series, reference, scene).value
+
+    return min(candidates, key=price)
 
 
 def one_a_method(scene: Scene) -> list[Series]:

@@ -114,10 +114,11 @@ def _comparison(data: Results) -> list[str]:
     ]
     about = "\n".join(f"- `{name}`: {ABOUT[name].meaning}" for name in (OURS[0], *methods))
     return [
-        "## Time to the same error, ours = 1",
-        "Error times time of each method, with its best setting, divided by that of "
-        f"`{OURS[0]}` as it comes: how many times longer it takes to the same error. Above 1 ours "
-        "is better.",
+        "## Error after the same time, ours = 1",
+        f"Error of each method, with its best setting, divided by that of `{OURS[0]}` as it comes, "
+        "after the time of the longest renders of ours. The error of a peer is taken to be a power "
+        "of the time between its measurements, and to fall as 1 / time outside. Above 1 ours is "
+        "better.",
         _table(heads, rows),
         about,
         *_samplers(data),
@@ -172,12 +173,11 @@ def _losses(data: Results) -> list[str]:
         return []
     heading = "## Where it does not win"
     if not lost:
-        return [heading, f"In none of {len(rows)} comparisons did a peer have less error x time."]
+        return [heading, f"In none of {len(rows)} comparisons did a peer have less error."]
     return [
         heading,
         f"Of {len(rows)} comparisons, all settings of all peers included, these are the "
-        f"{len(lost)} in which the peer's error times time was lower, trimmed or not, with 95 % "
-        "intervals.",
+        f"{len(lost)} in which the peer's error was lower, trimmed or not, with 95 % intervals.",
         _table(
             ["scene", "peer", "trimmed", "all pixels", "better"],
             [

@@ -55,6 +55,9 @@ class SampleMean:
         freedom = total**2 / parts if parts > 0 else math.inf
         return SampleMean(self.value - other.value, total, freedom)
 
+    def scaled(self, factor: float) -> SampleMean:
+        return SampleMean(factor * self.value, factor**2 * self.variance, self.freedom)
+
     def interval(self) -> Interval:
         quantile = float(stdtrit(min(self.freedom, 1e9), (1 + LEVEL) / 2))
         half = quantile * math.sqrt(self.variance)
@@ -89,21 +92,51 @@ def is_limited(point: Point, scene: Scene) -> bool:
     return point.error_trimmed.mean() < CLEARLY_ABOVE * scene.reference["error"]
 
 
+def clear_points(series: Series, scene: Scene) -> list[Point]:
+    """The renderings not limited by the reference; if all are, the shortest."""
+    clear = [point for point in series.points if not is_limited(point, scene)]
+    return clear or series.points[:1]
+
+
 def last_clear_point(series: Series, scene: Scene) -> Point:
     """The longest rendering not limited by the reference; if all are, the shortest."""
-    clear = [point for point in series.points if not is_limited(point, scene)]
-    return clear[-1] if clear else series.points[0]
+    return clear_points(series, scene)[-1]
 
 
 def cost(series: Series, scene: Scene, metric: str = "error_trimmed") -> SampleMean:
     """The logarithm of error times time: the error after one second if it falls as 1 / time."""
-    point = last_clear_point(series, scene)
-    return log_mean_of(getattr(point, metric) * point.seconds)
+    return _point_cost(last_clear_point(series, scene), metric)
 
 
 def gain(peer: Series, ours: Series, scene: Scene, metric: str = "error_trimmed") -> Interval:
-    """Error times time of ``peer`` divided by that of ``ours``: above 1, ours is better."""
-    return (cost(peer, scene, metric) - cost(ours, scene, metric)).exp_interval()
+    """Error of ``peer`` divided by that of ``ours`` after the same time: above 1, ours is better.
+
+    The time is that of the longest renderings of ours. The error of a peer is a power of the time
+    between its measurements and falls as 1 / time outside of them: what a render takes before its
+    first sample makes the slope at the ends too steep.
+    """
+    time = _seconds(last_clear_point(ours, scene))
+    return (_cost_at(time, peer, scene, metric) - cost(ours, scene, metric)).exp_interval()
+
+
+def _seconds(point: Point) -> float:
+    return float(point.seconds.mean())
+
+
+def _point_cost(point: Point, metric: str) -> SampleMean:
+    return log_mean_of(getattr(point, metric) * point.seconds)
+
+
+def _cost_at(time: float, series: Series, scene: Scene, metric: str) -> SampleMean:
+    """The logarithm of error times time is linear in that of the time: see :func:`gain`."""
+    points = clear_points(series, scene)
+    times = [_seconds(point) for point in points]
+    if not times[0] < time < times[-1]:
+        return _point_cost(points[0 if time <= times[0] else -1], metric)
+    first = int(np.searchsorted(times, time)) - 1
+    place = math.log(time / times[first]) / math.log(times[first + 1] / times[first])
+    before, after = (_point_cost(point, metric) for point in points[first : first + 2])
+    return before.scaled(1 - place) - after.scaled(-place)
 
 
 def bias(series: Series, scene: Scene) -> Interval:
@@ -131,8 +164,8 @@ class Reach:
 
 def time_to_reach(target: float, series: Series, scene: Scene) -> Reach | None:
     """Find when a series reaches the error ``target``; None if far from what was measured."""
-    points = [point for point in series.points if not is_limited(point, scene)]
-    if not points:
+    points = clear_points(series, scene)
+    if is_limited(points[0], scene):
         return None
     times = np.array([point.seconds.mean() for point in points])
     errors = [error_interval(point) for point in points]

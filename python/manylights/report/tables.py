@@ -20,7 +20,7 @@ from manylights.report.statistics import (
 
 @dataclass(frozen=True)
 class Efficiency:
-    """Error times time of a peer over that of ours; ``untrimmed`` is the same with all pixels."""
+    """Error of a peer over ours after the same time; ``untrimmed`` is the same with all pixels."""
 
     scene: Scene
     peer: str
