@@ -9,12 +9,15 @@ error that is confined to a part of the image.
 Half of the significance goes to the image mean and half to the tiles; within each half, Sidak's
 correction covers the channels and tiles. `significance` is therefore the probability that one
 comparison of two unbiased estimators fails.
+
+Where no sample counts in two pixels, these are independent, too: the variance of the mean of a set
+of pixels is then known from the variances of each, with many more degrees of freedom.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
@@ -61,14 +64,16 @@ def render_seeds(scene, integrator=None, spp=16, seeds=range(16), sensor=0):
     return images if images.ndim == 4 else images[..., np.newaxis]
 
 
-def tile_means(images, tile):
-    """Mean over square tiles of `tile` pixels (smaller at the right and lower border)."""
+def tile_sums(images, tile):
+    """Sums over square tiles of `tile` pixels (smaller at the right and lower border)."""
     rows = np.arange(0, images.shape[1], tile)
     columns = np.arange(0, images.shape[2], tile)
-    sums = np.add.reduceat(np.add.reduceat(images, rows, axis=1), columns, axis=2)
-    heights = np.diff(np.append(rows, images.shape[1]))
-    widths = np.diff(np.append(columns, images.shape[2]))
-    return sums / (heights[:, np.newaxis] * widths)[np.newaxis, :, :, np.newaxis]
+    return np.add.reduceat(np.add.reduceat(images, rows, axis=1), columns, axis=2)
+
+
+def tile_means(images, tile):
+    """Means over them."""
+    return tile_sums(images, tile) / tile_sums(np.ones((1, *images.shape[1:3], 1)), tile)
 
 
 def image_means(images):
@@ -106,6 +111,34 @@ def variance_of_mean(samples):
     return samples.var(axis=0, ddof=1) / count, count - 1
 
 
+def pixel_variances(images):
+    """Variance of each pixel, an array without seeds."""
+    return images.var(axis=0, ddof=1)
+
+
+def moments(images, tile, variances=None):
+    """Means over all images and one tile each, their variances, and the degrees of freedom.
+
+    `variances` are those of pixels that are independent; without them tiles are compared.
+    """
+    means = tile_means(images, tile)
+    if len(images) == 1 or variances is None:
+        return means.mean(axis=0), *variance_of_mean(means)
+    variance, dof = variance_of_tile_mean(variances, tile)
+    return means.mean(axis=0), variance / len(images), dof * (len(images) - 1)
+
+
+def variance_of_tile_mean(variances, tile):
+    """Variance of each tile's mean from those of its independent pixels, and a number of pixels.
+
+    Satterthwaite's: few where few pixels have nearly all of the variance.
+    """
+    variances = variances[np.newaxis]
+    size = tile_sums(np.ones_like(variances), tile)[0]
+    sums, squares = tile_sums(variances, tile)[0], tile_sums(variances**2, tile)[0]
+    return sums / size**2, np.divide(sums**2, squares, out=np.ones_like(sums), where=squares > 0)
+
+
 def welch(a, b, rounding=ROUNDING, black=0.0):
     """Welch tests of the means over axis 0. A sample of length one counts as an exact value."""
     variance_a, dof_a = variance_of_mean(a)
@@ -133,6 +166,15 @@ def welch_from_moments(
 def sidak(significance, tests):
     """Significance of each of `tests` independent tests that share `significance`."""
     return -np.expm1(np.log1p(-significance) / tests)
+
+
+CHANNEL = sidak(SIGNIFICANCE / 2, 3)
+"""Threshold of the image mean of one of three channels."""
+
+
+def visible_errors(dof, threshold=CHANNEL, power=POWER):
+    """How many standard errors a difference has that is found with probability `power`."""
+    return stats.t.isf(threshold / 2, dof) + stats.t.ppf(power, dof)
 
 
 @dataclass(frozen=True)
@@ -170,9 +212,8 @@ class Comparison:
         lit = self.image.mean_b != 0
         if not lit.any():
             return np.inf
-        quantiles = stats.t.isf(self.image_threshold / 2, self.image.dof)
-        quantiles = quantiles + stats.t.ppf(power, self.image.dof)
-        return float(np.max((quantiles * self.image.error)[lit] / np.abs(self.image.mean_b[lit])))
+        errors = visible_errors(self.image.dof, self.image_threshold, power) * self.image.error
+        return float(np.max(errors[lit] / np.abs(self.image.mean_b[lit])))
 
     def message(self, label=""):
         """A report in words: the image means and the worst tile."""
@@ -199,17 +240,35 @@ class Comparison:
         return "\n".join(lines)
 
 
-def compare_means(a, b, significance=SIGNIFICANCE, tile=8, rounding=ROUNDING):
+def compare_means(
+    a, b, significance=SIGNIFICANCE, tile=8, rounding=ROUNDING, independent_pixels=False
+):
     """Compare two sets of renderings of shape (seeds, height, width, channels).
 
-    A set of one image counts as the exact expectation (a closed form).
+    A set of one image counts as the exact expectation (a closed form). `independent_pixels` says
+    that no sample counts in two pixels of an image, in neither set.
     """
     if a.shape[1:] != b.shape[1:]:
         raise ValueError(f"images differ in shape: {a.shape[1:]} and {b.shape[1:]}")
-    image = welch(image_means(a), image_means(b), rounding)
+
+    variances = [
+        pixel_variances(images) if independent_pixels and len(images) > 1 else None
+        for images in (a, b)
+    ]
+
+    def compared(tile, black=0.0):
+        of_a, of_b = (moments(*parts) for parts in zip((a, b), (tile, tile), variances))
+        return welch_from_moments(*of_a, *of_b, rounding, black)
+
+    image = only_tile(compared(max(a.shape[1:3])))
     black = BLACK * np.abs(image.mean_b).max()
-    tiles = welch(tile_means(a, tile), tile_means(b, tile), rounding, black)
-    return Comparison(image, tiles, significance)
+    return Comparison(image, compared(tile, black), significance)
+
+
+def only_tile(test):
+    """The test of a single tile, an array for each channel."""
+    parts = (getattr(test, part.name) for part in fields(test))
+    return WelchTest(*(np.broadcast_to(part, test.error.shape)[0, 0] for part in parts))
 
 
 def assert_finite(images, label=""):
@@ -219,7 +278,15 @@ def assert_finite(images, label=""):
 
 
 def assert_same_mean(
-    a, b, significance=SIGNIFICANCE, tile=8, bias=BIAS, power=POWER, power_channels=None, label=""
+    a,
+    b,
+    significance=SIGNIFICANCE,
+    tile=8,
+    bias=BIAS,
+    power=POWER,
+    power_channels=None,
+    label="",
+    independent_pixels=False,
 ):
     """Assert that two estimators have the same mean, and that a relative `bias` would show.
 
@@ -229,11 +296,12 @@ def assert_same_mean(
     """
     assert_finite(a, label)
     assert_finite(b, label)
-    comparison = compare_means(a, b, significance, tile)
+    how = {"tile": tile, "independent_pixels": independent_pixels}
+    comparison = compare_means(a, b, significance, **how)
     assert comparison.passes, comparison.message(label)
     if bias is not None:
         channels = slice(None) if power_channels is None else power_channels
-        visible = compare_means(a[..., channels], b[..., channels], significance, tile)
+        visible = compare_means(a[..., channels], b[..., channels], significance, **how)
         found = visible.detectable_bias(power)
         assert found <= bias, (
             f"{label}: too noisy, only a bias of {100 * found:.2f} % would be found with "
@@ -254,23 +322,18 @@ def samples_for_precision(pilot, spp, seeds, error, largest=1 << 14, independent
     if not lit.any():
         return spp
     observations = pilot if independent_pixels else image_means(pilot)[:, np.newaxis, np.newaxis]
-    variance, dof = variance_of_pixel_sum(observations)
-    variance = variance[lit] / observations[0, ..., 0].size ** 2
+    variance, dof = variance_of_image_mean(observations)
+    variance = variance[lit]
     # The upper end of a one-sided 90 % interval of the variance: pilots are short.
     relative = variance * dof[lit] / stats.chi2.ppf(0.1, dof[lit]) / average[lit] ** 2
     needed = max(1.0, spp * np.max(relative) / (seeds * error**2))
     return int(min(largest, np.ceil(needed)))
 
 
-def variance_of_pixel_sum(images):
-    """Variance of the sum of independent pixels, and its degrees of freedom, for each channel.
-
-    They are those of Satterthwaite: few where few pixels have nearly all of the variance.
-    """
-    pixels = images.var(axis=0, ddof=1)
-    variance, squares = pixels.sum(axis=(0, 1)), (pixels**2).sum(axis=(0, 1))
-    dof = np.divide(variance**2, squares, out=np.ones_like(variance), where=squares > 0)
-    return variance, dof * (len(images) - 1)
+def variance_of_image_mean(images):
+    """Variance of the mean of one image of independent pixels, and its degrees of freedom."""
+    variance, pixels = variance_of_tile_mean(pixel_variances(images), max(images.shape[1:3]))
+    return variance[0, 0], pixels[0, 0] * (len(images) - 1)
 
 
 @dataclass(frozen=True)

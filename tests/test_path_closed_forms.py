@@ -16,7 +16,7 @@ from tests import statistics_tools as tools
 from tests.light_scenes import HEIGHT, WIDTH
 from tests.path_references import METHODS, PARAMETERS, light_tree, parameter_id, quick_and_slow
 from tests.path_scenes import homogeneous, rgb
-from tests.references import ERROR, planned_images
+from tests.references import ERROR, assert_same_mean, planned_images
 
 pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
@@ -34,16 +34,16 @@ FOG_CAMERA = closed_form.Camera((0, -3, 0), (0, 0, 0), (0, 0, 1), 30, 6, 4)
 def images_of(scene, **parameters):
     """Images of the integrator under test."""
     scene = mi.load_dict(scene)
-    return planned_images(scene, light_tree(**parameters), ERROR["tested"], first_seed=0)
+    return planned_images(scene, light_tree(**parameters), ERROR["tested alone"], first_seed=0)
 
 
 def assert_exact(images, exact, tile=8, label=""):
     """Compare with known pixel values; the same images may not pass for 2 % more."""
     exact = np.broadcast_to(exact, images.shape[1:])[np.newaxis]
-    tools.assert_same_mean(images, exact, tile=tile, label=label)
+    assert_same_mean(images, exact, tile=tile, label=label)
     for factor in (1.02, 1 / 1.02):
         with pytest.raises(AssertionError, match="significance"):
-            tools.assert_same_mean(images, factor * exact, tile=tile)
+            assert_same_mean(images, factor * exact, tile=tile)
 
 
 # ---------------------------------------------------------------------------------------- furnaces
@@ -117,7 +117,7 @@ def test_furnace_notices_absorption(llvm):
     images = images_of(path_scenes.furnace(grey))
     exact = np.broadcast_to(path_scenes.furnace_radiance(-1), images.shape[1:])[np.newaxis]
     with pytest.raises(AssertionError, match="significance"):
-        tools.assert_same_mean(images, exact)
+        assert_same_mean(images, exact)
 
 
 # -------------------------------------------------------------------------------------- absorption

@@ -14,7 +14,6 @@ from tests.conftest import require_variant
 from tests.make_references import (
     BLOCK,
     SEEDS,
-    blocks_of,
     load_scene,
     read_reference,
     reference_path,
@@ -25,13 +24,13 @@ pytestmark = pytest.mark.usefixtures("plugin")
 
 # Not those of the references: the two images share no random numbers.
 FIRST_SEED = 1000
-IMAGES, SAMPLES = 16, 16
+IMAGES, SAMPLES = 8, 12
 
 # The camera looks at hundreds of small, bright bulbs: their borders are most of the noise. In fog,
 # it is the lamps close by, and the glass, through which light is found by chance only. With more
-# images the quantiles of t are smaller. Visibility is learnt from 2^16 samples, 11 per pixel.
-EFFORT_OF = {"many_bulbs": (32, 12), "fog": (16, 12), "glass_fog": (32, 12)}
-EFFORT_OF["heterogeneous"] = (24, 12)
+# images the variance is better known. Visibility is learnt from 2^16 samples, 11 per pixel.
+EFFORT_OF = {"many_bulbs": (16, 12), "curves": (10, 12), "glass_fog": (12, 12)}
+EFFORT_OF["heterogeneous"] = (12, 12)
 BIAS_OF = {"no_lights": None}
 
 
@@ -52,21 +51,15 @@ def images_of(name, scene, sensor):
 def compare(images, path):
     """Comparison of renderings with a reference file: image mean and blocks."""
     mean, error = read_reference(path)
-    blocks = blocks_of(images)
+    # With a box filter pixels share no sample, and blocks neither: their errors are independent.
+    variances = tools.pixel_variances(images)
     tiles = tools.welch_from_moments(
-        blocks.mean(axis=0), *tools.variance_of_mean(blocks), mean, error**2, SEEDS - 1
+        *tools.moments(images, BLOCK, variances), mean, error**2, SEEDS - 1
     )
-    whole = blocks.mean(axis=(1, 2))
-    count = mean.shape[0] * mean.shape[1]
-    # Blocks share no pixel, and with a box filter no sample: their errors are independent.
-    variance = (error**2).sum(axis=(0, 1)) / count**2
-    image = tools.welch_from_moments(
-        whole.mean(axis=0),
-        *tools.variance_of_mean(whole),
-        mean.mean(axis=(0, 1)),
-        variance,
-        SEEDS - 1,
-    )
+    whole = max(images.shape[1:3])
+    found = (part[0, 0] for part in tools.moments(images, whole, variances))
+    variance, blocks = (part[0, 0] for part in tools.variance_of_tile_mean(error**2, whole))
+    image = tools.welch_from_moments(*found, mean.mean(axis=(0, 1)), variance, blocks * (SEEDS - 1))
     return tools.Comparison(image, tiles, tools.SIGNIFICANCE)
 
 

@@ -15,6 +15,7 @@ import pytest
 from manylights import scenes
 
 from tests import light_scenes
+from tests.shared_results import shared
 
 pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
@@ -124,7 +125,8 @@ def ramp(sampler, spp):
     return mi.load_dict(scene)
 
 
-def slope_variance(sampler, spp, learn):
+@shared
+def slope_variance(variant, sampler, spp, learn):
     """Variance of a pixel's mean position, times the number of samples."""
     scene = ramp(sampler, spp)
     integrator = load("manylights_direct", learn_visibility=learn, bsdf_samples=0)
@@ -140,9 +142,9 @@ def test_learning_keeps_the_pattern(variant, sampler):
     Its variance of a linear function is 1 / 64 of that of independent numbers and less; if a
     sixteenth of the samples had a pattern of their own it would be more than 1 / 10.
     """
-    independent = slope_variance("independent", SAMPLERS[sampler], True)
-    assert slope_variance(sampler, SAMPLERS[sampler], True) < independent / 40
-    assert slope_variance(sampler, SAMPLERS[sampler], False) < independent / 40
+    independent = slope_variance(variant, "independent", SAMPLERS[sampler], True)
+    assert slope_variance(variant, sampler, SAMPLERS[sampler], True) < independent / 40
+    assert slope_variance(variant, sampler, SAMPLERS[sampler], False) < independent / 40
 
 
 @pytest.mark.parametrize("sampler", ["independent", "multijitter"])

@@ -21,36 +21,40 @@ def synthetic_images(seed, seeds=16, relative_error=0.08, shape=SHAPE):
     return generator.gamma(concentration, mean / concentration, size=(seeds, *shape))
 
 
-def rejections(significance, **arguments):
+def rejections(significance, independent_pixels, **arguments):
     """Number of rejections among `TRIALS` comparisons of equal estimators."""
     count = 0
     for trial in range(TRIALS):
         a = synthetic_images(2 * trial, **arguments)
         b = synthetic_images(2 * trial + 1, **arguments)
-        count += not tools.compare_means(a, b, significance).passes
+        comparison = tools.compare_means(a, b, significance, independent_pixels=independent_pixels)
+        count += not comparison.passes
     return count
 
 
+@pytest.mark.parametrize(("seeds", "independent"), [(16, False), (8, True)])
 @pytest.mark.parametrize("relative_error", [0.1, 2.0])
-def test_comparison_keeps_its_level(relative_error):
+def test_comparison_keeps_its_level(relative_error, seeds, independent):
     """Equal means are rejected with the stated probability, also with very skewed pixels."""
     significance = 0.05
-    count = rejections(significance, relative_error=relative_error)
+    count = rejections(significance, independent, relative_error=relative_error, seeds=seeds)
     low, high = tools.binomial_interval(count, TRIALS, 1e-4)
     assert low <= significance
     # The channels of the synthetic images are independent, so the level is met, not undercut.
     assert high >= significance
 
 
+@pytest.mark.parametrize("independent", [False, True])
 @pytest.mark.parametrize("seeds_b", [4, 8])
-def test_comparison_keeps_its_level_with_unequal_sizes_and_variances(seeds_b):
+def test_comparison_keeps_its_level_with_unequal_sizes_and_variances(seeds_b, independent):
     """Welch's degrees of freedom hold when the reference has few, precise images."""
     significance = 0.05
     count = 0
     for trial in range(TRIALS):
         a = synthetic_images(2 * trial, relative_error=0.5)
         b = synthetic_images(2 * trial + 1, seeds=seeds_b, relative_error=0.1)
-        count += not tools.compare_means(a, b, significance).passes
+        comparison = tools.compare_means(a, b, significance, independent_pixels=independent)
+        count += not comparison.passes
     assert tools.binomial_interval(count, TRIALS, 1e-4)[0] <= significance
 
 
@@ -63,12 +67,13 @@ def test_comparison_finds_planted_bias_of_the_image():
         assert not tools.compare_means(a / 1.02, b).passes
 
 
-def test_comparison_finds_planted_bias_of_one_tile():
+@pytest.mark.parametrize("independent", [False, True])
+def test_comparison_finds_planted_bias_of_one_tile(independent):
     """An error in a single tile is found although it leaves the image mean unchanged."""
     a, b = (synthetic_images(seed, relative_error=0.03) for seed in (0, 1))
     a[:, :8, :8] *= 1.02
     a[:, 8:, 8:16] *= image_share(b)
-    comparison = tools.compare_means(a, b)
+    comparison = tools.compare_means(a, b, independent_pixels=independent)
     assert not comparison.passes
     assert (comparison.image.p >= comparison.image_threshold).all()
     assert "worst tile (row 0, column 0" in comparison.message()
@@ -80,14 +85,18 @@ def image_share(images):
     return 1 - 0.02 * tiles[0, 0] / tiles[1, 1]
 
 
-def test_power_is_met():
+@pytest.mark.parametrize("independent", [False, True])
+def test_power_is_met(independent):
     """A bias of the size `detectable_bias(power)` is found in that share of the trials."""
+    # Tiles cannot help here: one tile, the same as the image.
+    compared = functools.partial(
+        tools.compare_means, significance=1e-3, tile=24, independent_pixels=independent
+    )
     found = 0
     for trial in range(TRIALS):
         a, b = synthetic_images(2 * trial), synthetic_images(2 * trial + 1)
-        # Tiles cannot help here: one tile, the same as the image.
-        bias = tools.compare_means(a, b, 1e-3, tile=24).detectable_bias(power=0.5)
-        found += not tools.compare_means((1 + bias) * a[..., :1], b[..., :1], 1e-3, tile=24).passes
+        bias = compared(a, b).detectable_bias(power=0.5)
+        found += not compared((1 + bias) * a[..., :1], b[..., :1]).passes
     assert tools.binomial_interval(found, TRIALS, 1e-4)[1] >= 0.5
 
 
@@ -163,14 +172,26 @@ def test_sample_size_from_pilot(independent, room):
     assert plan(noisier, 4, seeds, error) > spp
 
 
+def test_pixels_tell_the_variance_of_means():
+    """It is that of the means of many images, of each tile and of the whole image."""
+    images = synthetic_images(0, seeds=2000, relative_error=0.5)
+    variances = tools.pixel_variances(images[:200])
+    for tile in (8, 24):
+        means, variance, dof = tools.moments(images[:200], tile, variances)
+        of_many = tools.tile_means(images, tile)
+        assert np.allclose(means, tools.tile_means(images[:200], tile).mean(axis=0))
+        assert np.allclose(variance, of_many.var(axis=0, ddof=1) / 200, rtol=0.2)
+        assert (dof > 199 * 0.5 * min(tile, 16) * min(tile, 24)).all()
+
+
 def test_few_pixels_tell_less_of_the_variance():
     """Where one of many pixels has all the noise, its renderings are what counts."""
     images = np.ones((8, 6, 4, 1))
     images[:, 2, 1] = np.random.default_rng(0).normal(1, 0.5, (8, 1))
-    variance, dof = tools.variance_of_pixel_sum(images)
-    assert np.allclose(variance, images[:, 2, 1].var(ddof=1)) and np.allclose(dof, 7)
+    variance, dof = tools.variance_of_image_mean(images)
+    assert np.allclose(variance, images[:, 2, 1].var(ddof=1) / 24**2) and np.allclose(dof, 7)
     even = np.random.default_rng(0).normal(1, 0.5, (8, 6, 4, 1))
-    assert tools.variance_of_pixel_sum(even)[1] > 7 * 12
+    assert tools.variance_of_image_mean(even)[1] > 7 * 12
 
 
 def probabilities_with_tail(cells=40):

@@ -43,10 +43,16 @@ def brightness(description, integrator, seeds=TAIL_SEEDS):
     return images.mean(axis=-1).reshape(seeds, -1)
 
 
-def images(name, error=ERROR["tested"], **parameters):
-    """Images whose mean has about that relative standard error."""
+def images(name, **parameters):
+    """Images of the integrator under test, as many as its mean needs."""
     scene = load(CASES[name].scene(), MEAN_SIZE)
+    error = ERROR["tested alone" if CASES[name].plain else "tested"]
     return planned_images(scene, integrator(name, **parameters), error, first_seed=0)
+
+
+def has_box_filter(name):
+    """True if the pixels of a case are independent."""
+    return CASES[name].scene()["sensor"]["film"]["rfilter"]["type"] == "box"
 
 
 def plain_image(description, order=4):

@@ -23,6 +23,14 @@ pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 RARE = 1e-4
 REFERENCE_SEEDS = 2
+MANY_LIGHTS = (
+    "coincident-10000",
+    "bright-far",
+    "huge-and-tiny-rough",
+    "huge-and-tiny-specular",
+)
+"""Cases with thousands of lights: all of them as candidates leave so little noise that one image
+tells the percentile to 3 % and less."""
 
 
 def assert_no_fireflies(values, reference, tail):
@@ -46,7 +54,8 @@ def assert_little_variance(values, limit):
 def test_distribution_of_samples(llvm, name):
     """Bright samples are as rare as in exhaustive resampling; the variance is what it was."""
     values = samples.single_samples(name)
-    reference = samples.single_samples(name, REFERENCE_SEEDS, method="exhaustive")
+    seeds = 1 if name in MANY_LIGHTS else REFERENCE_SEEDS
+    reference = samples.single_samples(name, seeds, method="exhaustive")
     assert_no_fireflies(values, reference, CASES[name].tail)
     assert_little_variance(values, CASES[name].variance)
 
