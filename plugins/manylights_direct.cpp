@@ -51,8 +51,8 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
    - :code:`resampled_tree`: all that is described below. The others are for comparison.
      :code:`talk`: stochastic splitting of a binary tree as in the original publication.
      :code:`adaptive_splitting`: a node of the binary tree is split where the light of its
-     cluster varies by more than 1/8 :code:`splitting_rate` of all the light (Conty Estevez
-     and Kulla 2018), and every candidate gets a shadow ray. :code:`tree`: one random descent
+     cluster varies by more than all the light over 8 :code:`splitting_rate` (Conty Estevez
+     and Kulla 2018), and every candidate gets a shadow ray, however many there are. :code:`tree`: one random descent
      and one shadow ray. :code:`exhaustive`: every light is a candidate.
      (Default: :code:`resampled_tree`)
 
@@ -67,8 +67,8 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
    - Adds the film channels :code:`candidates` and :code:`node_visits`: how many lights were
      considered, and how many nodes of the tree visited, on average per camera ray. Method
      :code:`resampled_tree` adds :code:`expected`: the luminance of the candidates' light that
-     should arrive by what is known of their visibility, all of it where nothing is known, 0
-     where shadow rays are traced to all lights. (Default: no, i.e. |false|)
+     should arrive by what is known of their visibility, all of it where nothing is known.
+     (Default: no, i.e. |false|)
 
  * - aovs
    - |string|
@@ -127,7 +127,8 @@ Hellmuth and Lecocq (SIGGRAPH Talks 2024). At each shading point,
 where :math:`\tau` is the step of the systematic sampling that chose them (:math:`\tau = 0` if
 all are traced). The estimate is unbiased, whatever :math:`h` and :math:`H`. With at most
 :math:`m` lights there is no tree: all of them are kept. Environment maps, suns and directional
-lights always take part in step 3.
+lights take part in step 3 at every point: up to eight of them all, of more one that is chosen at
+random.
 
 **It works well** wherever a few of many lights matter at each point, and the more so the more
 lights there are. **It works less well**
@@ -146,8 +147,9 @@ below each of its children, and the share :math:`v` of them that arrived. All ot
 with the number of rays; if nothing is hidden, they are rendered as usual. All samples count in the
 image, which stays unbiased, and the same seed gives the same bits. The table takes at most 42 MB.
 Nothing is learnt from images with fewer than :math:`2^{16}` samples in LLVM variants or
-:math:`2^{23}` in CUDA variants, where another pass costs more than it gains, where all lights are
-considered anyway, and while differentiating; an integrator that is nested in others which only ask
+:math:`2^{23}` in CUDA variants, and more in proportion where there are more than 32 materials and
+emissive shapes: there another pass costs more than it gains. Nor where all lights are
+considered anyway, nor while differentiating; an integrator that is nested in others which only ask
 it for samples uses what it has kept, and learns nothing. What was kept is dropped with the
 integrator: load another one to start anew.
 

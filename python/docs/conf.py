@@ -25,6 +25,9 @@ extensions = [
 ]
 exclude_patterns = ["gallery/*"]
 
+# Quotes in commands are to be copied
+smartquotes = False
+
 # Anchors of headings as GitHub has them
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]

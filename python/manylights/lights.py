@@ -26,6 +26,9 @@ KINDS = {
     "TimedSunskyEmitter": "timed_sunsky",
 }
 
+#: Of emitters on surfaces, the one that is sampled triangle by triangle
+AREA = "AreaLight"
+
 
 def describe(
     path: str,
@@ -60,14 +63,14 @@ def describe(
 
 
 def count_kinds(scene) -> Counter:
-    """Count the lights of a scene by kind; each triangle of an emissive mesh is one light."""
+    """Count the lights of a scene by kind; each triangle of a mesh with an area light is one."""
     counts: Counter = Counter()
     for emitter in scene.emitters():
         shape = emitter.get_shape()
         kind = KINDS.get(emitter.class_name(), emitter.class_name())
         if shape is None:
             counts[kind] += 1
-        elif shape.is_mesh():
+        elif shape.is_mesh() and emitter.class_name() == AREA:
             counts[f"{_surface_kind(emitter)} triangle"] += shape.primitive_count()
         else:
             counts[f"{_surface_kind(emitter)} {shape.class_name().lower()}"] += 1

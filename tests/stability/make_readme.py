@@ -42,8 +42,8 @@ NOISE = """
 
 A strip of floor under three clusters of 100 points each (`scenes.cut_boundary`), 4,096 receivers of
 4 mm. Where clusters are split by a rule (`adaptive_splitting`) the noise jumps: the largest step of
-its logarithm is {step:.2f}. (Its noise is lower and its time longer: it traces a ray to every light
-that it considers.) The default and `talk` split by a random number and have none: what
+its logarithm is {step:.2f}. (Its noise is lower: it considers more lights.)
+The default and `talk` split by a random number and have none: what
 looks steep here is continuous at that scale. The bends of the default are where a light's
 probability of being a candidate reaches 1.
 """
