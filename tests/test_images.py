@@ -138,6 +138,20 @@ def test_info_of_a_part_is_short(tmp_path, capsys):
     assert all(len(line) < 200 for line in told.splitlines())
 
 
+@pytest.mark.parametrize("pixels", ["rgb", "luminance", "xyz"])
+def test_preview_does_not_mind_channels_without_a_dot(tmp_path, pixels):
+    """Those of `counts` are in one list with the colours."""
+    pictures = []
+    for counts in (False, True):
+        described = scene()
+        described["camera"]["film"]["pixel_format"] = pixels
+        integrator = {"type": "manylights_direct", "counts": counts}
+        path = tmp_path / f"{counts}.exr"
+        manylights.render(described, spp=2, output=path, integrator=integrator)
+        pictures.append(np.array(mi.Bitmap(str(path.with_suffix(".png")))))
+    assert pictures[0].max() > 0 and (pictures[0] == pictures[1]).all()
+
+
 @pytest.mark.parametrize("option", ["render", "merge"])
 def test_the_preview_alone_gets_brighter(tmp_path, option):
     paths = [tmp_path / "a.exr", tmp_path / "b.exr"]

@@ -1,10 +1,12 @@
 """Loading: the reader follows from the file's name, and all go the same way from there."""
 
+import re
 import sys
 import types
 from pathlib import Path
 
 import manylights
+import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import loading
@@ -116,3 +118,67 @@ def test_files_are_looked_for_beside_a_link(scalar, tmp_path):
     (links / "part.ply").write_bytes(triangle.read_bytes())
     (links / "scene.xml").symlink_to(shapes / "scene.xml")
     assert links / "part.ply" in loading.load(str(links / "scene.xml")).files
+
+
+@pytest.mark.parametrize("spheres", range(1, 16))
+def test_sensor_without_a_sampler_gets_one_however_many_nodes_there_are(scalar, tmp_path, spheres):
+    """Mitsuba's list of nodes moves when it grows; 4, 8 and 16 of them used to end the process."""
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="manylights_direct"/><sensor type="perspective"/>'
+        + spheres * '<shape type="sphere"/>'
+        + "</scene>"
+    )
+    (sensor,) = loading.load(str(path)).scene.sensors()
+    assert sensor.sampler().class_name() == "SobolSampler"
+
+
+MISTAKES = {
+    "integrator": ("", "<float name='spliting_rate' value='2'/>"),
+    "sensor": ("<float name='fovv' value='45'/>", ""),
+    "sampler": ("<sampler type='independent'><integer name='samples' value='2'/></sampler>", ""),
+    "film": ("<film type='hdrfilm'><integer name='widht' value='8'/></film>", ""),
+}
+
+
+@pytest.mark.parametrize("place", MISTAKES)
+def test_unknown_parameter_is_refused_wherever_it_is(scalar, tmp_path, capsys, place):
+    """As by `mi.load_file`, though loading has looked at all parameters itself."""
+    path = tmp_path / "scene.xml"
+    in_sensor, in_integrator = MISTAKES[place]
+    path.write_text(
+        f'<scene version="3.0.0"><integrator type="manylights_direct">{in_integrator}</integrator>'
+        f'<sensor type="perspective">{in_sensor}</sensor><shape type="sphere"/></scene>'
+    )
+    name = re.search("name='(\\w+)' value", in_sensor + in_integrator)[1]
+    command = ["render", str(path), "-o", str(tmp_path / "a.exr"), "--variant", "scalar_rgb"]
+    assert main(command) == 2
+    message = capsys.readouterr().err
+    assert f'"{name}"' in message and f"{place} plugin" in message and "scene.xml" in message
+    assert not (tmp_path / "a.exr").exists()
+
+
+def test_unknown_parameter_of_a_merged_lamp_is_refused(scalar):
+    scene = stage()
+    scene["lamp_1"] = {**scene["lamp_1"], "flip": True}
+    with pytest.raises(RuntimeError, match='"flip"'):
+        manylights.render(scene, spp=1)
+
+
+@pytest.mark.parametrize(("width", "height"), [(0, 8), (8, 0), (33000, 33000)])
+def test_films_of_no_size_or_too_large_are_refused(scalar, width, height):
+    scene = stage()
+    scene["sensor"]["film"] |= {"width": width, "height": height}
+    scene["sensor"]["fov"] = 40
+    with pytest.raises(UsageError, match=f"film {width} x {height}: .*(1 x 1|2\\^32)"):
+        manylights.render(scene, spp=1)
+
+
+@pytest.mark.parametrize("plugin", ["manylights_direct", "manylights_volpath"])
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_film_without_pixels_is_refused_by_the_plugins(variant, plugin):
+    scene = stage()
+    scene["sensor"] |= {"fov": 40, "film": {**scene["sensor"]["film"], "width": 0}}
+    integrator = mi.load_dict({"type": plugin})
+    with pytest.raises(RuntimeError, match="the film has 0 x 8 pixels"):
+        mi.render(mi.load_dict(scene), integrator=integrator, spp=1)

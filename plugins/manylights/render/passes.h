@@ -13,6 +13,7 @@
 #include <mitsuba/render/film.h>
 #include <mitsuba/render/sampler.h>
 #include <mitsuba/render/sensor.h>
+#include <stdexcept>
 #include <string>
 #include <string_view>
 
@@ -20,9 +21,14 @@ namespace manylights {
 
 namespace dr = drjit;
 
-/// Pixels that are rendered: with those beyond the border that the filter reaches, if wanted
+/// Pixels that are rendered: with those beyond the border that the filter reaches, if wanted.
+/// Throws if there are none
 template <typename Film> mitsuba::Vector<uint32_t, 2> film_size(const Film *film) {
     auto size = film->crop_size();
+    if (dr::prod(size) == 0)
+        throw std::runtime_error("manylights: the film has " + std::to_string(size.x()) +
+                                 " x " + std::to_string(size.y()) +
+                                 " pixels, but must have at least 1 x 1.");
     if (film->sample_border())
         size += 2 * film->rfilter()->border_size();
     return size;

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights.loading import light_groups
+from manylights.loading import light_groups, parsing
 from manylights.loading.integrators import PARAMETERS, leaf_integrators
 from manylights.output import channels
 
@@ -376,6 +376,7 @@ class _Merging:
             for name, part in node.items():
                 if isinstance(part, Reference):
                     props[name] = self._object(part)
+            parsing.forget_queries(props)
             self.objects[index] = self._make(props)
         return self.objects[index]
 

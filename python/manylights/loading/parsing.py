@@ -144,7 +144,7 @@ def instantiate(parsed: ParsedScene):
 
     Raises:
         UsageError: the file describes something that is not a scene, or an image is not whole.
-        RuntimeError: Mitsuba cannot make something.
+        RuntimeError: Mitsuba cannot make something, or does not know one of its properties.
     """
     config, state = parsed.config, parsed.state
     _check_images(parsed.files)
@@ -153,10 +153,21 @@ def instantiate(parsed: ParsedScene):
         mi.parser.transform_merge_equivalent(config, state)
     if config.merge_meshes:
         mi.parser.transform_merge_meshes(config, state)
+    for node in state.nodes:
+        forget_queries(node.props)
     scene = mi.parser.instantiate(config, state)
     if not isinstance(scene, mi.Scene):
         raise UsageError("the file holds no <scene>")
     return scene
+
+
+def forget_queries(props) -> None:
+    """Let Mitsuba find properties that a plugin does not know.
+
+    It refuses those that nobody has asked for, and whoever reads all in Python has asked for all.
+    """
+    for key in list(props.keys()):
+        props.mark_queried(key, False)
 
 
 def _check_images(files: list[Path]) -> None:

@@ -26,14 +26,16 @@ def choose(state, wanted: str | None) -> list[str]:
     if wanted == "keep":
         return []
     new, replaced = wanted or SOBOL, []
-    for node in list(state.nodes):
+    # By number: nodes move when others are appended
+    for index in range(len(state.nodes)):
+        node = state.nodes[index]
         if node.type == mi.ObjectType.Sampler:
             old = node.props.plugin_name()
             if old != new and (wanted or old in REPLACED):
                 _replace(node.props, new)
                 replaced.append(old)
         elif node.type == mi.ObjectType.Sensor and not _has_sampler(node, state):
-            _add(state, node.props, new)
+            _add(state, index, new)
             replaced.append("independent")
     names = ", ".join(dict.fromkeys(replaced))
     undo = " (--sampler keep undoes it)" if wanted is None else ""
@@ -41,17 +43,21 @@ def choose(state, wanted: str | None) -> list[str]:
 
 
 def _replace(props, new: str) -> None:
-    for name in [key for key, _ in props.items() if key not in SHARED]:
-        del props[name]
+    # What those in REPLACED do not have either is a mistake, which Mitsuba names
+    names = [] if props.plugin_name() in REPLACED else list(props.keys())
+    for name in names:
+        if name not in SHARED:
+            del props[name]
     props.set_plugin_name(new)
 
 
-def _add(state, sensor, new: str) -> None:
+def _add(state, sensor: int, new: str) -> None:
     node = mi.parser.SceneNode()
     node.type = mi.ObjectType.Sampler
     node.props = mi.Properties(new)
     state.nodes.append(node)
-    sensor["_arg_sampler"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+    sampler = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+    state.nodes[sensor].props["_arg_sampler"] = sampler
 
 
 def _has_sampler(node, state) -> bool:

@@ -206,9 +206,14 @@ def join(channels: list[str], *parts: np.ndarray):
 
 def colors(bitmap):
     """Return a bitmap of the colour channels alone, ``None`` if there are none."""
-    if bitmap.pixel_format() == _formats.MultiChannel:
-        bitmap = dict(bitmap.split()).get("<root>", bitmap)
-    return None if bitmap.pixel_format() == _formats.MultiChannel else bitmap
+    if bitmap.pixel_format() != _formats.MultiChannel:
+        return bitmap
+    known = names(bitmap)
+    chosen = colors_in(known)
+    if chosen is None:
+        return None
+    pixels = np.array(bitmap, copy=False)[..., [known.index(name) for name in chosen]]
+    return mi.Bitmap(pixels, getattr(_formats, "".join(chosen)))
 
 
 def read_colors(path: str | Path, prefix: str = "") -> np.ndarray:

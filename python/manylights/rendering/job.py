@@ -91,6 +91,7 @@ class Job:
         for name, value in (("until_noise", noise), ("seconds", seconds)):
             check(name, value, value is None or 0.0 < value < np.inf, "a number above 0")
         driver = Driver(loaded, sensors[sensor], integrator)
+        _check_film(driver)
         _check_groups(driver)
         part = Part.of(part)
         if part is not None:
@@ -203,6 +204,19 @@ def _check_part(part: Part, driver: Driver, noise, seconds) -> None:
     film = driver.sensor.film().class_name()
     if film not in FILMS:
         raise UsageError(f"{part.words()}: parts of a {film} cannot be merged, only of an hdrfilm")
+
+
+def _check_film(driver: Driver) -> None:
+    """Refuse films without pixels, and those of which Dr.Jit cannot have an array."""
+    width, height = map(int, driver.sensor.film().crop_size())
+    channels = 4 + len(driver.integrator.aov_names())
+    if width * height == 0:
+        raise UsageError(f"film {width} x {height}: must be at least 1 x 1")
+    if width * height * channels >= 2**32:
+        raise UsageError(
+            f"film {width} x {height}: {width * height * channels:,} numbers in {channels} "
+            "channels, must be less than 2^32"
+        )
 
 
 def _check_groups(driver: Driver) -> None:
