@@ -133,6 +133,26 @@ def test_sensor_without_a_sampler_gets_one_however_many_nodes_there_are(scalar, 
     assert sensor.sampler().class_name() == "SobolSampler"
 
 
+@pytest.mark.parametrize(
+    ("name", "words"), [("", "is a folder"), ("a.exr", "is an image"), ("a.xml", "no such file")]
+)
+def test_what_is_no_scene_is_told(scalar, tmp_path, name, words):
+    (tmp_path / "a.exr").write_bytes(b"")
+    with pytest.raises(UsageError, match=words):
+        loading.load(str(tmp_path / name))
+
+
+def test_scene_without_sensor_or_lights_is_told(scalar, tmp_path, capsys):
+    path = tmp_path / "scene.xml"
+    path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    assert any("has none" in note for note in loading.load(str(path)).notes)
+    command = ["render", str(path), "-o", str(tmp_path / "a.exr"), "--variant", "scalar_rgb"]
+    assert main(command) == 2
+    assert "scene.xml: has no sensor" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="the scene has no sensor"):
+        manylights.render(str(path), spp=1)
+
+
 MISTAKES = {
     "integrator": ("", "<float name='spliting_rate' value='2'/>"),
     "sensor": ("<float name='fovv' value='45'/>", ""),

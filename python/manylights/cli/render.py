@@ -259,7 +259,10 @@ def _load_and_render(options, target: Path, defines, settings, connection=None) 
         say(note)
     count = len(loaded.scene.sensors())
     if not 0 <= options.sensor < count:
-        raise UsageError(f"--sensor {options.sensor}: the scene has {count}, counted from 0")
+        has = f"0 to {count - 1} are there" if count > 1 else "there is number 0 alone"
+        raise UsageError(
+            f"--sensor {options.sensor}: {has}" if count else f"{options.scene}: has no sensor"
+        )
     names = ("spp", "seed", "sensor", "until_noise", "seconds", "threads")
     names += ("denoise", "exposure", "tev")
     wanted = {name: getattr(options, name) for name in names}

@@ -147,6 +147,8 @@ def _choose_and_make(
     choices = {"integrator": integrator, "set": settings}
     choices |= {"sampler": sampler} if sampler else {}
     scene = instantiate(parsed)
+    if not scene.emitters():
+        notes.append("lights: the scene has none, its image is black")
     return LoadedScene(scene, max(count, 1), notes, parsed.files, parsed.exposure, choices)
 
 

@@ -17,6 +17,9 @@ from manylights.errors import UsageError, one_line
 #: Endings of USD stages: whichever format, in text, binary, and packed.
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 
+#: Files that are taken for scenes by mistake.
+IMAGE_ENDINGS = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
+
 
 #: Each level has four times as many faces: more fill the memory.
 MOST_SUBDIVISION = 6
@@ -75,11 +78,15 @@ def parse(
             those of ``usd_options``.
 
     Raises:
-        UsageError: there is no such file, usd-core is missing, or ``defines`` for a stage.
+        UsageError: there is no such file, it is an image, usd-core is missing, or there are
+            ``defines`` for a stage.
         RuntimeError: Mitsuba cannot read it.
     """
     if not Path(path).is_file():
-        raise UsageError(f"{path}: no such file")
+        what = "is a folder, not a scene" if Path(path).is_dir() else "no such file"
+        raise UsageError(f"{path}: {what}")
+    if Path(path).suffix.lower() in IMAGE_ENDINGS:
+        raise UsageError(f"{path}: is an image, not a scene (an XML file or a USD stage)")
     if Path(path).suffix.lower() in USD_ENDINGS:
         options = usd_options or UsdOptions()
         groups = light_groups or options.light_groups

@@ -85,6 +85,8 @@ class Job:
                 such a render.
         """
         sensors = loaded.scene.sensors()
+        if not sensors:
+            raise UsageError("the scene has no sensor")
         check("sensor", sensor, 0 <= sensor < len(sensors), f"0 to {len(sensors) - 1}")
         check("spp", spp, spp is None or 1 <= spp < 2**32, "1 to 4294967295")
         check("seed", seed, 0 <= seed < 2**32, "0 to 4294967295")
