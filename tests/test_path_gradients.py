@@ -282,3 +282,75 @@ def full_text(error):
         texts.append(str(error))
         error = error.__cause__ or error.__context__
     return "\n".join(texts)
+
+
+ZERO = rgb([0.0] * 3)
+AT_ZERO = {
+    "floor.bsdf.reflectance.value": (1.0, 2),
+    "lamp_0.intensity.value": (1.0, 2),
+    "fog.interior_medium.albedo.value.value": (0.5, 2),
+    "wall.bsdf.reflectance.value": (0.5, 3),
+}
+
+
+def black_scene():
+    """Three points above a floor, a wall and a cube of fog, all black."""
+    to_world = path_scenes.transform().look_at([0, -4, 3], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
+    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": ZERO}
+    place = path_scenes.transform().translate([0, 1.5, 0]).rotate([1, 0, 0], 90).scale(2)
+    scene = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": to_world, "film": film},
+        "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": rgb([0.1] * 3)}},
+        "wall": {
+            "type": "rectangle",
+            "to_world": place,
+            "bsdf": {"type": "diffuse", "reflectance": rgb([0.2] * 3)},
+        },
+        "fog": {
+            "type": "cube",
+            "to_world": path_scenes.transform().translate([0.8, -0.5, 0.5]).scale(0.3),
+            "bsdf": {"type": "null"},
+            "interior": fog,
+        },
+    }
+    for index in range(3):
+        position = [index - 1.0, 0.3 * index, 1.0]
+        scene[f"lamp_{index}"] = {"type": "point", "position": position, "intensity": ZERO}
+    return scene
+
+
+@pytest.mark.parametrize("key", AT_ZERO)
+def test_gradients_at_zero_are_differences(llvm, key):
+    """What is black in all channels is of consequence where its derivative is wanted.
+
+    The image is linear in each of these parameters but the albedo, of which there is one factor in
+    light that is scattered once. The wall is one of two factors: its light comes by the floor.
+    """
+    value, depth = AT_ZERO[key]
+    scene = mi.load_dict(black_scene())
+    parameters = mi.traverse(scene)
+    for name in (*AT_ZERO, "lamp_1.intensity.value", "lamp_2.intensity.value"):
+        parameters[name] = mi.Color3f(0.0 if name == key else 0.5)
+    if depth == 2:
+        parameters["wall.bsdf.reflectance.value"] = mi.Color3f(0.0)
+    black = mi.Color3f(0.0)
+    dr.enable_grad(black)
+    parameters[key] = black
+    parameters.update()
+    integrator = light_tree(max_depth=depth)
+    image = mi.render(scene, parameters, integrator=integrator, spp=4096, seed=1)
+    dr.forward(black, dr.ADFlag.ClearEdges)
+    found = np.array(dr.grad(image))
+    difference = np.zeros(3)
+    for step, sign in ((0.0, -1), (value, 1)):
+        parameters[key] = mi.Color3f(step)
+        parameters.update()
+        difference += (
+            sign
+            * np.array(mi.render(scene, integrator=integrator, spp=4096, seed=1)).mean((0, 1))
+            / value
+        )
+    assert difference.min() > 1e-4
+    np.testing.assert_allclose(found.mean((0, 1)), difference, rtol=0.02)

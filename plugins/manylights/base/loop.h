@@ -96,6 +96,14 @@ template <typename Float, typename F> auto call_flat(const F &f) {
 /// these, so that gradients flow through the chosen lights' values only
 template <typename T> auto plain(const T &value) { return dr::detach<false>(value); }
 
+/// Are derivatives of a value wanted? Then zeros are of consequence, too
+template <typename T> bool has_derivatives(const T &value) {
+    if constexpr (dr::is_diff_v<T>)
+        return dr::grad_enabled(value);
+    else
+        return false;
+}
+
 /// Root mean square of the channels of a colour
 template <typename Color> auto root_mean_square(const Color &color) {
     return dr::norm(color) * .57735027f;

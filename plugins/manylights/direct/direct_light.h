@@ -174,7 +174,9 @@ private:
         Float u1         = s.sampler->next_1d(active);
         auto [bs, value] = vertex.bsdf->sample(ctx, si, u1, u2, active);
         value            = si.to_world_mueller(value, -bs.wo, si.wi);
-        Mask reflected   = active && dr::any(mitsuba::unpolarized_spectrum(value) != 0.f);
+        Mask reflected =
+            active && (dr::any(mitsuba::unpolarized_spectrum(value) != 0.f) ||
+                       has_derivatives(value));
         SurfaceInteraction3f hit;
         auto [light, emits] =
             m_emission.find_light(si.spawn_ray(si.to_world(bs.wo)), hit, reflected);

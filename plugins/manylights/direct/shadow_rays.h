@@ -239,7 +239,11 @@ private:
     Spectrum trace_sample(const Vertex &vertex, const Sample &sample, Rng &rng,
                           Mask active) const {
         // Drops invalid values as well
-        active &= Mask(Reader::target(sample.unoccluded()) > 0.f);
+        Spectrum value = sample.unoccluded();
+        Mask counts(Reader::target(value) > 0.f);
+        if (has_derivatives(value))
+            counts |= dr::all(dr::isfinite(mitsuba::unpolarized_spectrum(value)));
+        active &= counts;
         if (dr::none_or<false>(active))
             return Spectrum(0.f);
         return visible(vertex, sample, rng, active);

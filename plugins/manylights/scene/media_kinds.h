@@ -2,6 +2,7 @@
 
 /// Which participating media a scene has: code for others is not even recorded.
 
+#include "manylights/base/loop.h"
 #include "manylights/emission/emission_reader.h"
 #include "scene_shapes.h"
 #include <mitsuba/render/medium.h>
@@ -43,6 +44,8 @@ template <typename Float, typename Spectrum> struct MediumReader {
         });
         for (const auto &sensor : scene->sensors())
             add(kinds, sensor->medium());
+        // Shadow rays pass them with or without media
+        kinds.any |= kinds.borders;
         return kinds;
     }
 
@@ -72,9 +75,15 @@ template <typename Float, typename Spectrum> struct MediumReader {
     }
 
     static bool may_scatter(const Medium *medium) {
+        constexpr std::string_view name = "albedo.value.value";
+        ParameterReader params(medium);
+        const Float *value = params.find<Float>(name);
+        const Color *color = params.find<Color>(name);
+        if ((value && has_derivatives(*value)) || (color && has_derivatives(*color)))
+            return true;
         float albedo[3];
-        return !read(medium, "albedo.value.value", albedo) || albedo[0] != 0 ||
-               albedo[1] != 0 || albedo[2] != 0;
+        return !read(medium, name, albedo) || albedo[0] != 0 || albedo[1] != 0 ||
+               albedo[2] != 0;
     }
 
     static bool may_be_chromatic(const Medium *medium) {
