@@ -96,13 +96,12 @@ This integrator traces paths from the camera through scenes with very many light
 the direct light of every vertex with the light tree of :ref:`manylights_direct
 <integrator-manylights_direct>`, on surfaces and in participating media alike.
 
-**Without media** it computes what :monosp:`path` computes: a surface that lets light pass
-straight on is a vertex like any other, and shadow rays end on it. **With media** it computes
-what :monosp:`volpath` computes: homogeneous and heterogeneous media with spectrally varying
-extinction, any phase function, nested and index-matched boundaries, cameras and lights inside
-of media. Surfaces without an effect (:monosp:`null`, :monosp:`thindielectric`,
-:monosp:`mask`) are then no vertices, and shadow rays pass them. Nothing of this is part of the
-kernel in scenes without media.
+It computes what :monosp:`volpath` computes: homogeneous and heterogeneous media with spectrally
+varying extinction, any phase function, nested and index-matched boundaries, cameras and lights
+inside of media. Surfaces that let light pass straight on (:monosp:`null`,
+:monosp:`thindielectric`, :monosp:`mask`) are no vertices where it does, and shadow rays pass them:
+a pane does not block the sun, as it does in :monosp:`path`. Nothing of this is part of the kernel
+in scenes without media and such surfaces, where :monosp:`path` computes the same.
 
 **Single scattering.** In a homogeneous medium, the light that a piece of a path of length
 :math:`L` receives is not estimated at one random distance, but along all of it. The tree

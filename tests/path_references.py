@@ -1,12 +1,14 @@
 """The path tracer under test, and the integrators of Mitsuba that it is compared with.
 
-Scenes without media are compared with `path`, those with media with `volpath`. Emitters are chosen
-by power for the references, which leaves their mean alone and saves most of the samples. As for
-direct light the references of scalar variants are rendered in the LLVM variant with the same
-spectra, and kept for the rest of the run.
+Scenes without media are compared with `path`, those with media, or with surfaces that let light
+pass straight on, with `volpath`. Emitters are chosen by power for the references, which leaves
+their mean alone and saves most of the samples. As for direct light the references of scalar
+variants are rendered in the LLVM variant with the same spectra, and kept for the rest of the run.
 """
 
 from __future__ import annotations
+
+from functools import cache
 
 import mitsuba as mi
 import pytest
@@ -68,8 +70,15 @@ def light_tree(**parameters):
 
 def known(name, **parameters):
     """Mitsuba's integrator for the scene `name`."""
-    kind = "path" if name in path_scenes.SURFACES else "volpath"
+    kind = "path" if name in path_scenes.SURFACES and not lets_light_through(name) else "volpath"
     return mi.load_dict({"type": kind, **parameters})
+
+
+@cache
+def lets_light_through(name):
+    """Has the scene `name` surfaces that light passes straight on?"""
+    shapes = path_scenes.load(name).shapes()
+    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in shapes)
 
 
 def depth_of(name):

@@ -273,6 +273,29 @@ def test_light_of_lamp_under_mask(variant, opacity):
     assert_exact(images_of(scene, max_depth=3), exact, tile=1)
 
 
+BLACK = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.0}}
+SHEETS = {
+    "mask": {"type": "mask", "opacity": 0.4, "nested": BLACK},
+    "blend": {"type": "blendbsdf", "weight": 0.4, "one": {"type": "null"}, "two": BLACK},
+    "two-masks": {"type": "mask", "opacity": 1 - 0.6**0.5, "nested": BLACK},
+}
+
+
+@both_variants
+@pytest.mark.parametrize("sheet", SHEETS)
+def test_point_behind_a_sheet_that_lets_light_through(variant, sheet):
+    """A sheet of opacity .4 leaves .6 of the light of a point, though no path can hit that."""
+    lights = [closed_form.Light((0, 0, 2), (8.0, 6.0, 4.0))]
+    camera = closed_form.Camera((0, -2, 1.5), (0, 0, 0), (0, 0, 1), 40, 6, 4)
+    scene = closed_form.scene_dict(camera, lights, ALBEDO)
+    heights = (1.9, 1.8) if sheet == "two-masks" else (1.9,)
+    for index, height in enumerate(heights):
+        frame = path_scenes.transform().translate([0, 0, height]).scale(3)
+        scene[f"sheet_{index}"] = {"type": "rectangle", "to_world": frame, "bsdf": SHEETS[sheet]}
+    exact = 0.6 * closed_form.plane_image(camera, lights, ALBEDO)
+    assert_exact(images_of(scene, max_depth=2), exact, tile=1, label=sheet)
+
+
 # ---------------------------------------------------------------------------------- one scattering
 
 FLAKES = (0.15, 0.35, 0.9, 0.05, 0.1, -0.1)

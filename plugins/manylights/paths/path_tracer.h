@@ -7,9 +7,9 @@
  * is one), the emission of what it ended on, the direct light of the vertex, the choice of
  * the next direction, Russian roulette, and the next intersection.
  *
- * Without media a path is that of Mitsuba's `path`; with media it is that of `volpath`:
- * surfaces that let light pass straight on do not count as vertices, and shadow rays pass
- * them, too.
+ * With media, or surfaces that let light pass straight on, a path is that of Mitsuba's
+ * `volpath`: such surfaces do not count as vertices, and shadow rays pass them, too. In other
+ * scenes it is that of `path`.
  */
 
 #include "manylights/direct/direct_light.h"
@@ -288,7 +288,7 @@ private:
 
     void play_roulette(State &s, const Roulette<Float> &roulette) const {
         Float most = dr::max(mitsuba::unpolarized_spectrum(s.throughput));
-        s.active &= most != 0.f;
+        s.active &= most != 0.f || has_derivatives(s.throughput);
         Float go_on =
             dr::detach(dr::minimum(most * roulette.factor * dr::square(s.eta), .95f));
         Mask plays = s.depth >= m_limits.rr_depth;

@@ -108,6 +108,9 @@ SHARED_PARAMETERS = (
     (BASE_PARAMETERS, USING_BLOCKS),
 )
 
+#: BSDFs that let light pass straight on, at least in part.
+PASSED_STRAIGHT_ON = ("mask", "null", "thindielectric")
+
 #: Why an integrator stays that one of ours could replace.
 STAYS = {"volpathmis": f" stays: {VOLPATH} has no spectral MIS (--integrator {VOLPATH} uses it)"}
 
@@ -297,11 +300,16 @@ def _translate_samples(props) -> list[str]:
 
 
 def _about_media(state, old: str, new: str) -> list[str]:
-    """Say so if the image changes since the old integrator ignores the scene's media."""
-    has_media = any(node.type == mi.ObjectType.Medium for node in state.nodes)
-    if (old, new) != ("path", VOLPATH) or not has_media:
+    """Say so if the image changes since the old integrator ignores something of the scene."""
+    if (old, new) != ("path", VOLPATH):
         return []
-    return [f"integrator: the scene has media, which {old} ignores and {new} renders"]
+    if any(node.type == mi.ObjectType.Medium for node in state.nodes):
+        return [f"integrator: the scene has media, which {old} ignores and {new} renders"]
+    names = [node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.BSDF]
+    passed = next((name for name in names if name in PASSED_STRAIGHT_ON), None)
+    if passed is None:
+        return []
+    return [f"integrator: shadow rays of {old} end on surfaces of {passed}, those of {new} do not"]
 
 
 def _apply(props, settings: dict[str, Any]) -> None:
