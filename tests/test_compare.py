@@ -207,3 +207,19 @@ def test_wrong_numbers(capsys, write, picture, option):
         main(["compare", path, path, *option])
     assert raised.value.code == 2
     assert f"{option[1]}: must be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, 1e-20, 1e-8, 1e20])
+def test_flip_takes_black_and_dim_references(factor):
+    """flip-evaluator ends the process where it finds no exposure."""
+    image = np.random.default_rng(1).random((16, 16, 3), dtype=np.float32)
+    found = metrics.flip_error(image, np.float32(factor) * image)
+    assert 0.1 < found <= 1.0
+    assert metrics.flip_error(0 * image, np.float32(factor) * image) >= 0.0
+    if factor > 0:
+        assert metrics.flip_error(factor * image, factor * image) == 0.0
+
+
+def test_flip_of_black_images_is_nothing():
+    black = np.zeros((16, 16, 3), np.float32)
+    assert metrics.flip_error(black, black) == metrics.flip_error(-1.0 + black, black) == 0.0

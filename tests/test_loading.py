@@ -142,6 +142,15 @@ def test_what_is_no_scene_is_told(scalar, tmp_path, name, words):
         loading.load(str(tmp_path / name))
 
 
+@pytest.mark.parametrize(
+    "option", ["--camera=/c", "--time=1", "--default-light", "--legacy-lights", "--subdivision=1"]
+)
+def test_options_of_stages_are_refused_for_xml(scalar, capsys, option):
+    scene = Path(__file__).parents[1] / "scenes" / "points.xml"
+    assert main(["tree", str(scene), "--variant", "scalar_rgb", option]) == 2
+    assert f"{option.split('=')[0]}: {scene} is XML" in capsys.readouterr().err
+
+
 def test_scene_without_sensor_or_lights_is_told(scalar, tmp_path, capsys):
     path = tmp_path / "scene.xml"
     path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
@@ -201,4 +210,4 @@ def test_film_without_pixels_is_refused_by_the_plugins(variant, plugin):
     scene["sensor"] |= {"fov": 40, "film": {**scene["sensor"]["film"], "width": 0}}
     integrator = mi.load_dict({"type": plugin})
     with pytest.raises(RuntimeError, match="the film has 0 x 8 pixels"):
-        mi.render(mi.load_dict(scene), integrator=integrator, spp=1)
+        integrator.render(mi.load_dict(scene), seed=0, spp=1)

@@ -57,7 +57,8 @@ def flip_error(image: np.ndarray, reference: np.ndarray) -> float:
     """Return the mean of HDR-FLIP, from 0 for equal images to 1.
 
     It is a model of the difference that a person sees who flips between the two (Andersson et al.
-    2021), seen at 67 pixels per degree and at several exposures.
+    2021), seen at 67 pixels per degree and at several exposures, which follow from the reference,
+    or from the image if the reference is black.
 
     Raises:
         UsageError: the package flip-evaluator is not installed.
@@ -65,5 +66,13 @@ def flip_error(image: np.ndarray, reference: np.ndarray) -> float:
     flip = extras.require("flip_evaluator", "flip-evaluator")
     # Copies: arrays that may not be written to are refused
     pair = [np.array(array, dtype=np.float32, order="C") for array in (reference, image)]
+    if pair[0].max() <= 0.0:
+        pair.reverse()
+    brightest = float(pair[0].max())
+    if brightest <= 0.0:
+        return 0.0
+    # Where no exposure fits flip ends the process
+    if not 1e-3 <= brightest <= 1e6:
+        pair = [np.float32(array / brightest) for array in pair]
     _, mean, _ = flip.evaluate(*pair, "HDR", applyMagma=False)
     return float(mean)

@@ -6,7 +6,7 @@ The ending of the file's name chooses the reader; after it XML and USD go the sa
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ def parse(
 
     Raises:
         UsageError: there is no such file, it is an image, usd-core is missing, or there are
-            ``defines`` for a stage.
+            ``defines`` for a stage or options of stages for XML.
         RuntimeError: Mitsuba cannot read it.
     """
     if not Path(path).is_file():
@@ -91,6 +91,11 @@ def parse(
         options = usd_options or UsdOptions()
         groups = light_groups or options.light_groups
         return _parse_usd(path, defines or {}, replace(options, light_groups=groups))
+    for known in fields(UsdOptions):
+        given = getattr(usd_options, known.name, known.default)
+        if given != known.default and known.name != "light_groups":
+            option = known.name.replace("_", "-")
+            raise UsageError(f"--{option}: {path} is XML, the option is for USD stages")
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **(defines or {}))
     mi.parser.transform_upgrade(config, state)
