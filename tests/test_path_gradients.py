@@ -291,6 +291,9 @@ AT_ZERO = {
     "fog.interior_medium.albedo.value.value": (0.5, 2),
     "wall.bsdf.reflectance.value": (0.5, 3),
 }
+#: Roulette must not end what is black
+ROULETTE = [pytest.param(key, 5, id=key) for key in AT_ZERO]
+ROULETTE += [pytest.param("wall.bsdf.reflectance.value", 1, id="roulette")]
 
 
 def black_scene():
@@ -321,8 +324,8 @@ def black_scene():
     return scene
 
 
-@pytest.mark.parametrize("key", AT_ZERO)
-def test_gradients_at_zero_are_differences(llvm, key):
+@pytest.mark.parametrize(("key", "rr_depth"), ROULETTE)
+def test_gradients_at_zero_are_differences(llvm, key, rr_depth):
     """What is black in all channels is of consequence where its derivative is wanted.
 
     The image is linear in each of these parameters but the albedo, of which there is one factor in
@@ -339,7 +342,7 @@ def test_gradients_at_zero_are_differences(llvm, key):
     dr.enable_grad(black)
     parameters[key] = black
     parameters.update()
-    integrator = light_tree(max_depth=depth)
+    integrator = light_tree(max_depth=depth, rr_depth=rr_depth)
     image = mi.render(scene, parameters, integrator=integrator, spp=4096, seed=1)
     dr.forward(black, dr.ADFlag.ClearEdges)
     found = np.array(dr.grad(image))
