@@ -52,8 +52,8 @@ Direct illumination from many lights (:monosp:`manylights_direct`)
      :code:`talk`: stochastic splitting of a binary tree as in the original publication.
      :code:`adaptive_splitting`: a node of the binary tree is split where the light of its
      cluster varies by more than all the light over 8 :code:`splitting_rate` (Conty Estevez
-     and Kulla 2018), and every candidate gets a shadow ray, however many there are. :code:`tree`: one random descent
-     and one shadow ray. :code:`exhaustive`: every light is a candidate.
+     and Kulla 2018), and every candidate gets a shadow ray, however many there are.
+     :code:`tree`: one random descent and one shadow ray. :code:`exhaustive`: every light is a candidate.
      (Default: :code:`resampled_tree`)
 
  * - split_function
@@ -148,8 +148,8 @@ with the number of rays; if nothing is hidden, they are rendered as usual. All s
 image, which stays unbiased, and the same seed gives the same bits. The table takes at most 42 MB.
 Nothing is learnt from images with fewer than :math:`2^{16}` samples in LLVM variants or
 :math:`2^{23}` in CUDA variants, and more in proportion where there are more than 32 materials and
-emissive shapes: there another pass costs more than it gains. Nor where all lights are
-considered anyway, nor while differentiating; an integrator that is nested in others which only ask
+emissive shapes: there another pass costs more than it gains. Nothing is learnt, either, where all
+lights are considered anyway, and while differentiating; an integrator that is nested in others which only ask
 it for samples uses what it has kept, and learns nothing. What was kept is dropped with the
 integrator: load another one to start anew.
 

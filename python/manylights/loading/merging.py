@@ -376,7 +376,6 @@ class _Merging:
             for name, part in node.items():
                 if isinstance(part, Reference):
                     props[name] = self._object(part)
-            parsing.forget_queries(props)
             self.objects[index] = self._make(props)
         return self.objects[index]
 
@@ -386,7 +385,7 @@ class _Merging:
         node.props = props
         state = mi.parser.ParserState()
         state.nodes.append(node)
-        return mi.parser.instantiate(self.config, state)
+        return parsing.make_objects(self.config, state)
 
 
 def _try(function, *arguments):

@@ -20,7 +20,6 @@ USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 #: Files that are taken for scenes by mistake.
 IMAGE_ENDINGS = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
 
-
 #: Each level has four times as many faces: more fill the memory.
 MOST_SUBDIVISION = 6
 
@@ -165,21 +164,22 @@ def instantiate(parsed: ParsedScene):
         mi.parser.transform_merge_equivalent(config, state)
     if config.merge_meshes:
         mi.parser.transform_merge_meshes(config, state)
-    for node in state.nodes:
-        forget_queries(node.props)
-    scene = mi.parser.instantiate(config, state)
+    scene = make_objects(config, state)
     if not isinstance(scene, mi.Scene):
         raise UsageError("the file holds no <scene>")
     return scene
 
 
-def forget_queries(props) -> None:
-    """Let Mitsuba find properties that a plugin does not know.
+def make_objects(config, state):
+    """Make the root of a parsed state; a property that a plugin does not know is refused.
 
-    It refuses those that nobody has asked for, and whoever reads all in Python has asked for all.
+    Mitsuba refuses those that nobody has asked for. Whoever has read all in Python has asked for
+    all: that is forgotten first.
     """
-    for key in list(props.keys()):
-        props.mark_queried(key, False)
+    for node in state.nodes:
+        for key in list(node.props.keys()):
+            node.props.mark_queried(key, False)
+    return mi.parser.instantiate(config, state)
 
 
 def _check_images(files: list[Path]) -> None:

@@ -93,14 +93,13 @@ def is_limited(point: Point, scene: Scene) -> bool:
 
 
 def clear_points(series: Series, scene: Scene) -> list[Point]:
-    """The renderings not limited by the reference; if all are, the shortest."""
-    clear = [point for point in series.points if not is_limited(point, scene)]
-    return clear or series.points[:1]
+    """The renderings not limited by the reference, the shortest first."""
+    return [point for point in series.points if not is_limited(point, scene)]
 
 
 def last_clear_point(series: Series, scene: Scene) -> Point:
     """The longest rendering not limited by the reference; if all are, the shortest."""
-    return clear_points(series, scene)[-1]
+    return (clear_points(series, scene) or series.points[:1])[-1]
 
 
 def cost(series: Series, scene: Scene, metric: str = "error_trimmed") -> SampleMean:
@@ -129,7 +128,7 @@ def _point_cost(point: Point, metric: str) -> SampleMean:
 
 def _cost_at(time: float, series: Series, scene: Scene, metric: str) -> SampleMean:
     """The logarithm of error times time is linear in that of the time: see :func:`gain`."""
-    points = clear_points(series, scene)
+    points = clear_points(series, scene) or series.points[:1]
     times = [_seconds(point) for point in points]
     if not times[0] < time < times[-1]:
         return _point_cost(points[0 if time <= times[0] else -1], metric)
@@ -165,9 +164,9 @@ class Reach:
 def time_to_reach(target: float, series: Series, scene: Scene) -> Reach | None:
     """Find when a series reaches the error ``target``; None if far from what was measured."""
     points = clear_points(series, scene)
-    if is_limited(points[0], scene):
+    if not points:
         return None
-    times = np.array([point.seconds.mean() for point in points])
+    times = np.array([_seconds(point) for point in points])
     errors = [error_interval(point) for point in points]
     value, measured = _crossing(times, np.array([error.value for error in errors]), target)
     if value is None:
