@@ -30,6 +30,16 @@ template <typename Float> struct Roulette {
     Float u = Float(0.f), factor = Float(1.f);
 };
 
+/// Of a path's throughput, 0 where it ends: what is black goes on like white if its derivative is
+/// wanted
+template <typename Float, typename Spectrum>
+Float roulette_brightness(const Spectrum &throughput) {
+    Float most = dr::max(mitsuba::unpolarized_spectrum(throughput));
+    if (has_derivatives(throughput))
+        most = dr::select(most == 0.f, 1.f, most);
+    return most;
+}
+
 /// What a path carries from step to step
 template <typename Float, typename Spectrum> struct PathState {
     MI_IMPORT_TYPES(Sampler, Medium, MediumPtr)

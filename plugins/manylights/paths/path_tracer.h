@@ -287,9 +287,7 @@ private:
     }
 
     void play_roulette(State &s, const Roulette<Float> &roulette) const {
-        Float most = dr::max(mitsuba::unpolarized_spectrum(s.throughput));
-        if (has_derivatives(s.throughput)) // of what is black, too
-            most = dr::select(most == 0.f, 1.f, most);
+        Float most = roulette_brightness<Float>(s.throughput);
         s.active &= most != 0.f;
         Float go_on =
             dr::detach(dr::minimum(most * roulette.factor * dr::square(s.eta), .95f));
