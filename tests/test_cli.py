@@ -624,9 +624,38 @@ def test_help_begins_with_examples_that_are_understood(command):
         parser().parse_args(shlex.split(re.split(r"\s{3,}", line.strip())[0])[1:])
 
 
-def test_no_command():
-    process = manylights()
-    assert process.returncode == 2 and "COMMAND" in process.stderr
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("", "manylights: which COMMAND? (see manylights --help)"),
+        ("rendr", "manylights: COMMAND invalid choice: 'rendr'"),
+        ("render", "manylights render: the following arguments are required: SCENE, -o/--output ("),
+        ("render --spp 0", "manylights render: --spp 0: must be an integer of at least 1 ("),
+        ("render --spp many", "manylights render: --spp many: must be an integer of at least 1 ("),
+        ("render --sensor -1", "render: --sensor -1: must be an integer of at least 0 ("),
+        ("render --seed 1.5", "render: --seed 1.5: must be an integer from 0 to 4294967295 ("),
+        ("render --seed 4294967296", "render: --seed 4294967296: must be an integer from 0 to"),
+        ("render --exposure high", "render: --exposure high: must be a number from -64 to 64 ("),
+        ("render s.xml -o o.exr --fast", "render: unknown: --fast (see manylights render --help)"),
+        ("tree a.xml b.xml", "manylights tree: unknown: b.xml (see manylights tree --help)"),
+        ("demo --lights 0", "demo: --lights 0: must be an integer from 1 to 1,000,000 ("),
+        ("demo --lights 1000001", "--lights 1000001: must be an integer from 1 to 1,000,000 ("),
+        ("bench --seeds few", "manylights bench: --seeds few: must be at least 1, the number of"),
+    ],
+)
+def test_a_wrong_command_line_gets_one_line(capsys, command, message):
+    with pytest.raises(SystemExit) as raised:
+        cli.main(command.split())
+    assert raised.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line and line.endswith("--help)")
+
+
+def test_demo_does_not_add_an_ending_twice(tmp_path, capsys):
+    small = ["--lights", "1", "--spp", "1", "--width", "4", "--height", "4"]
+    out = str(tmp_path / "city.exr")
+    assert cli.main(["demo", "-o", out, *small, "--variant", "scalar_rgb"]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["city.exr", "city.png"]
 
 
 def test_estimate_advances_between_reports_but_not_past_the_next_one():

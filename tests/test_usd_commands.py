@@ -145,8 +145,8 @@ def test_lamps_of_converted_stage_keep_their_colours(tmp_path):
     ("options", "message"),
     [
         (["--camera", "/World/nowhere"], "/World/nowhere"),
-        (["--time", "noon"], "noon: must be a number"),
-        (["--subdivision", "9"], "9: must be from 0 to 6"),
+        (["--time", "noon"], "--time noon: must be a number"),
+        (["--subdivision", "9"], "--subdivision 9: must be an integer from 0 to 6"),
         (["-D", "spp=4"], "-D spp"),
     ],
 )

@@ -178,6 +178,4 @@ def _sample_counts(text: str) -> list[int]:
 
 
 def _seeds(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least 1, the number of seeds")
-    return int(text)
+    return shared.integer(text, 1, None, "at least 1, the number of seeds")

@@ -117,25 +117,33 @@ def start(options) -> str:
 
 def positive(text: str) -> int:
     """An integer of at least 1."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
-    return value
+    return integer(text, 1, None, "an integer of at least 1")
 
 
 def seed(text: str) -> int:
     """A seed of 32 bits."""
-    value = int(text)
-    if not 0 <= value < 2**32:
-        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to 4294967295")
-    return value
+    return integer(text, 0, 2**32 - 1, "an integer from 0 to 4294967295")
+
+
+def index(text: str) -> int:
+    """A place in a list."""
+    return integer(text, 0, None, "an integer of at least 0")
+
+
+def integer(text: str, least: int, most: int | None, allowed: str) -> int:
+    """An integer in a range, which is said in words."""
+    try:
+        value = int(text)
+        if least <= value and (most is None or value <= most):
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text}: must be {allowed}")
 
 
 def levels(text: str) -> int:
     """A number of refinements: each makes four times as many faces."""
-    if not text.isdigit() or int(text) > MOST_SUBDIVISION:
-        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to {MOST_SUBDIVISION}")
-    return int(text)
+    return integer(text, 0, MOST_SUBDIVISION, f"an integer from 0 to {MOST_SUBDIVISION}")
 
 
 def time_code(text: str) -> float:

@@ -88,7 +88,9 @@ def add(commands, common) -> None:
     )
     shared.add_scene(parser)
     parser.add_argument("-o", "--output", required=True, metavar="OUT.exr", help="image to write")
-    parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    parser.add_argument(
+        "--sensor", type=shared.index, default=0, help="index of the sensor (default: 0)"
+    )
     _add_targets(parser)
     method = parser.add_argument_group("integrator and sampler")
     method.add_argument(
@@ -258,7 +260,7 @@ def _load_and_render(options, target: Path, defines, settings, connection=None) 
     for note in loaded.notes:
         say(note)
     count = len(loaded.scene.sensors())
-    if not 0 <= options.sensor < count:
+    if options.sensor >= count:
         has = f"0 to {count - 1} are there" if count > 1 else "there is number 0 alone"
         raise UsageError(
             f"--sensor {options.sensor}: {has}" if count else f"{options.scene}: has no sensor"

@@ -17,6 +17,9 @@ COOL = (0.72, 0.86, 1.0)
 WHITE = (1.0, 0.93, 0.82)
 NEON = ((1.0, 0.08, 0.45), (0.1, 0.9, 1.0), (0.45, 1.0, 0.2), (1.0, 0.45, 0.05), (0.5, 0.2, 1.0))
 
+#: Of a scene.
+MOST_LIGHTS = 1_000_000
+
 
 @dataclass
 class Quads:
@@ -60,8 +63,8 @@ def require_variant() -> None:
 
 def check_count(n_lights: int, least: int = 1) -> int:
     """Return ``n_lights``; raise ValueError unless it is an integer in ``least`` to 1,000,000."""
-    if int(n_lights) != n_lights or not least <= n_lights <= 1_000_000:
-        raise ValueError(f"n_lights={n_lights}: must be an integer from {least} to 1,000,000")
+    if int(n_lights) != n_lights or not least <= n_lights <= MOST_LIGHTS:
+        raise ValueError(f"n_lights={n_lights}: must be an integer from {least} to {MOST_LIGHTS:,}")
     return int(n_lights)
 
 
