@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import manylights as package
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -228,7 +229,7 @@ def test_scene_without_integrator_can_be_kept(choose):
     name, _, notes = choose("", "keep")
     assert name is None
     assert "Mitsuba uses path" in notes[0]
-    with pytest.raises(UsageError, match="choose one with --integrator"):
+    with pytest.raises(UsageError, match=r'name one \(integrator="NAME"\)'):
         choose("", "keep", max_depth=2)
 
 
@@ -290,7 +291,7 @@ def test_unknown_parameters_are_refused_with_those_of_the_integrator(choose, plu
     for text in (integrator(plugin), integrator("path")):
         with pytest.raises(UsageError) as raised:
             choose(text, plugin, **{wrong: 1})
-        assert f"--set {wrong}: {plugin} has no such parameter" in str(raised.value)
+        assert f'integrator["{wrong}"]: {plugin} has no such parameter' in str(raised.value)
         assert listed in str(raised.value) and f"{wrong} (" not in str(raised.value)
 
 
@@ -408,6 +409,78 @@ def test_unknown_parameter(scene, tmp_path):
 def test_parameter_out_of_range(scene, tmp_path):
     process = manylights("render", scene, "-o", tmp_path / "o.exr", "--set", "splitting_rate=-1")
     assert_fails(process, "splitting_rate", "-1")
+
+
+SPHERE = {"type": "scene", "sensor": {"type": "perspective"}, "ball": {"type": "sphere"}}
+DEPTH = {**SPHERE, "integrator": {"type": "depth"}}
+
+
+@pytest.mark.parametrize(
+    ("python", "said", "shell", "typed"),
+    [
+        ({"output": "o.png"}, "output o.png: the image is", "-o o.png", "-o o.png: the image is"),
+        (
+            {"learnt": "a.exr"},
+            "learnt a.exr: must be given with part",
+            "--learnt a.exr",
+            "--learnt a.exr: must be given with --part",
+        ),
+        (
+            {"part": (1, 2), "exposure": 1.0},
+            "exposure 1.0: must be left out with part, and given to manylights.merge",
+            "--part 1/2 --exposure 1",
+            "--exposure 1.0: must be left out with --part, and given to manylights merge",
+        ),
+        (
+            {"integrator": {"type": "manylights_direct", "reservoir": 2}},
+            'integrator["reservoir"]: manylights_direct has no such',
+            "--set reservoir=2",
+            "--set reservoir: manylights_direct has no such",
+        ),
+        ({"aovs": "color"}, "aovs 'color': must be", "--aov color", "--aov 'color': must be"),
+        (
+            {"scene": DEPTH, "aovs": "uv"},
+            "aovs: depth shows no surfaces, manylights_direct or manylights_volpath do (int",
+            "--integrator depth --aov uv",
+            "--aov: depth shows no surfaces, manylights_direct or manylights_volpath do (--int",
+        ),
+        (
+            {"scene": DEPTH, "light_groups": "a=b"},
+            "light_groups: depth has none, ",
+            "--integrator depth --light-groups a=b",
+            "--light-groups: depth has none, ",
+        ),
+        ({"tev": "a:b"}, "tev a:b: must be HOST:PORT", "--tev a:b", "--tev a:b: must be HOST:PORT"),
+    ],
+)
+def test_messages_name_what_was_typed_in_python_or_in_the_shell(
+    scene, tmp_path, monkeypatch, capsys, python, said, shell, typed
+):
+    monkeypatch.chdir(tmp_path)
+    require_variant("scalar_rgb")
+    with pytest.raises(UsageError) as raised:
+        package.render(**{"scene": SPHERE, "spp": 1, **python})
+    assert str(raised.value).startswith(said)
+    command = ["render", str(scene), "--spp", "1", "--variant", "scalar_rgb", *shlex.split(shell)]
+    assert cli.main(command + ([] if "-o" in command else ["-o", "o.exr"])) == 2
+    assert f"manylights: {typed}" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.exr"))
+
+
+def test_notes_say_how_to_undo_a_choice_in_python_or_in_the_shell(scene, tmp_path, capsys):
+    require_variant("scalar_rgb")
+    notes = package.render(scene, spp=1).notes
+    assert any(note.endswith('(integrator="keep" undoes it)') for note in notes)
+    assert any(note.endswith("(an mi.Scene keeps its own)") for note in notes)
+    command = ["render", str(scene), "-o", str(tmp_path / "o.exr"), "--spp", "1"]
+    assert cli.main([*command, "--variant", "scalar_rgb"]) == 0
+    said = capsys.readouterr().err
+    assert "(--integrator keep undoes it)" in said and "(--sampler keep undoes it)" in said
+
+
+def test_convert_names_its_output_as_it_was_typed(capsys):
+    assert cli.main(["convert", "stage.usda", "out.txt"]) == 2
+    assert capsys.readouterr().err.startswith("manylights: out.txt: Mitsuba's scenes are XML files")
 
 
 def test_unknown_scene_parameter(scene, tmp_path):

@@ -404,7 +404,9 @@ def test_variants_without_colours_say_which_have_them(variant):
             integrator='light_groups = "key=lamp_*"', sensor=SimpleNamespace(film=lambda: film)
         )
         colored = variant.partition("_mono")[0] + "_rgb"
-        with pytest.raises(UsageError, match=f"no colours in {variant}, .*--variant {colored} has"):
+        with pytest.raises(
+            UsageError, match=f"no colours in {variant}, .*the variant {colored} has"
+        ):
             job._check_groups(driver)
     finally:
         mi.set_variant(before or "scalar_rgb")

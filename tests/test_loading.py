@@ -89,7 +89,9 @@ def test_the_ending_chooses_the_reader(usd, scalar, tmp_path, ending):
 
 
 def test_defaults_of_a_stage_are_refused(usd, scalar):
-    with pytest.raises(UsageError, match=r"-D spp: .*stage\.usda is USD, only XML has <default>"):
+    with pytest.raises(
+        UsageError, match=r"defines spp: .*stage\.usda is USD, only XML has <default>"
+    ):
         loading.load(str(usd.path), {"spp": "4"})
 
 

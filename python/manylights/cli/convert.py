@@ -38,7 +38,9 @@ def add(commands, common) -> None:
 def _run(options) -> None:
     if not options.stage.lower().endswith(USD_ENDINGS):
         raise UsageError(f"{options.stage}: not a USD stage ({', '.join(USD_ENDINGS)})")
-    target = files.check_output(options.output, "Mitsuba's scenes are XML files", ".xml")
+    target = files.check_output(
+        options.output, "Mitsuba's scenes are XML files", ".xml", named=False
+    )
     usd = import_usd(options.stage)
     loading.set_variant(options.variant)
     with waiting("loading"):

@@ -22,7 +22,7 @@ from manylights.cli import (
     tree,
     version,
 )
-from manylights.errors import one_line
+from manylights.errors import in_shell, one_line
 from manylights.progress import INTERRUPTED
 
 #: Exit status of a command that could not do what was asked.
@@ -75,7 +75,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.command is None:
         made.error("which COMMAND?")
     try:
-        return options.command(options) or 0
+        with in_shell():
+            return options.command(options) or 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -12,7 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument, typed
 from manylights.loading import light_groups
 from manylights.output import channels
 
@@ -112,7 +112,7 @@ SHARED_PARAMETERS = (
 PASSED_STRAIGHT_ON = ("mask", "null", "thindielectric")
 
 #: Why an integrator stays that one of ours could replace.
-STAYS = {"volpathmis": f" stays: {VOLPATH} has no spectral MIS (--integrator {VOLPATH} uses it)"}
+STAYS = {"volpathmis": f" stays: {VOLPATH} has no spectral MIS"}
 
 
 def parse_value(text: str) -> bool | int | float | str:
@@ -178,7 +178,8 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
         for node in leaves:
             notes.extend(_replace(state, node.props, wanted))
     if settings and not leaves:
-        raise UsageError("--set: the scene has no integrator, choose one with --integrator NAME")
+        name = next(iter(settings))
+        raise UsageError(f"{_parameter(name)}: the scene has no integrator, name one{_by_name()}")
     for node in leaves:
         _apply(node.props, settings)
     return notes
@@ -254,7 +255,11 @@ def _replace(state, props, wanted: str | None) -> list[str]:
     old = props.plugin_name()
     new = wanted or REPLACEMENTS.get(old, old)
     if old == new:
-        stays = STAYS.get(old, "") if wanted is None else ""
+        stays = (
+            f"{STAYS[old]}{_by_name(VOLPATH, ' uses it')}"
+            if wanted is None and old in STAYS
+            else ""
+        )
         return [f"integrator: {old}{_listed(props)}{stays}"]
     notes = []
     if (old, new) == ("direct", DIRECT):
@@ -271,7 +276,20 @@ def _replace(state, props, wanted: str | None) -> list[str]:
 
 
 def _undo(wanted: str | None) -> str:
-    return " (--integrator keep undoes it)" if wanted is None else ""
+    return _by_name("keep", " undoes it") if wanted is None else ""
+
+
+def _by_name(name: str = "NAME", does: str = "") -> str:
+    """Return how the user chooses an integrator, and what that does, in brackets."""
+    how = typed(f'integrator="{name}"', f"--integrator {name}")
+    return f" ({how}{does})"
+
+
+def _parameter(name: str) -> str:
+    """Return what the user calls a parameter of the integrator."""
+    if name in ("aovs", light_groups.PARAMETER):
+        return argument(name)
+    return typed(f'integrator["{name}"]', f"--set {name}")
 
 
 def _means_the_same(parameter: str, old: str, new: str) -> bool:
@@ -295,7 +313,7 @@ def _translate_samples(props) -> list[str]:
         return []
     return [
         f"integrator: emitter_samples={emitter_samples} has no counterpart, "
-        "set shadow_rays and reservoirs with --set instead"
+        f"set shadow_rays and reservoirs{typed('', ' with --set')} instead"
     ]
 
 
@@ -319,13 +337,16 @@ def _apply(props, settings: dict[str, Any]) -> None:
             settings = {name: value for name, value in settings.items() if name != "aovs"}
         else:
             known = " or ".join(PARAMETERS)
-            raise UsageError(f"aovs: {plugin} shows no surfaces, {known} do (--integrator NAME)")
+            raise UsageError(
+                f"{argument('aovs')}: {plugin} shows no surfaces, {known} do{_by_name()}"
+            )
     for name, value in settings.items():
         if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
             known = "; ".join(f"{key} ({what})" for key, what in PARAMETERS[plugin].items())
-            raise UsageError(f"--set {name}: {plugin} has no such parameter. It has: {known}")
+            raise UsageError(f"{_parameter(name)}: {plugin} has no such parameter. It has: {known}")
         if name == light_groups.PARAMETER and plugin not in PARAMETERS:
-            raise UsageError(f"light groups: {plugin} has none, {' and '.join(PARAMETERS)} have")
+            known = " and ".join(PARAMETERS)
+            raise UsageError(f"{argument(name)}: {plugin} has none, {known} have{_by_name()}")
         props[name] = value
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError, one_line
+from manylights.errors import UsageError, argument, one_line
 
 #: Endings of USD stages: whichever format, in text, binary, and packed.
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -93,8 +93,7 @@ def parse(
     for known in fields(UsdOptions):
         given = getattr(usd_options, known.name, known.default)
         if given != known.default and known.name != "light_groups":
-            option = known.name.replace("_", "-")
-            raise UsageError(f"--{option}: {path} is XML, the option is for USD stages")
+            raise UsageError(f"{argument(known.name)}: {path} is XML, that is for USD stages")
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_file(config, str(path), **(defines or {}))
     mi.parser.transform_upgrade(config, state)
@@ -103,7 +102,9 @@ def parse(
 
 def _parse_usd(path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
     if defines:
-        raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
+        raise UsageError(
+            f"{argument('defines')} {next(iter(defines))}: {path} is USD, only XML has <default>"
+        )
     description = import_usd(path).load(path, **asdict(options))
     parsed = parse_description(description)
     # A stage composes layers that no node of the scene names.

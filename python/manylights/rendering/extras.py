@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from manylights.errors import argument, typed
 from manylights.loading import light_groups
 from manylights.loading.integrators import Wish
 from manylights.output import channels, images
@@ -63,19 +64,16 @@ class Extras:
         for name in ("denoise", "exposure"):
             value = getattr(extras, name)
             whole = not value or part is None
-            check(name, value, whole, "left out with part, and given to manylights.merge")
+            merge = typed("manylights.merge", "manylights merge")
+            check(name, value, whole, f"left out with {argument('part')}, and given to {merge}")
         if extras.denoise:
             denoising.check_installed()
         return extras
 
-    def parameters(self, option: str = "aovs") -> dict[str, str]:
-        """Return the parameters of our integrators for the channels that are wanted of them.
-
-        Args:
-            option: what ``aovs`` were given with, for messages.
-        """
+    def parameters(self) -> dict[str, str]:
+        """Return the parameters of our integrators for the channels that are wanted of them."""
         wanted = denoising.with_guides(self.aovs) if self.denoise else self.aovs
-        added = {} if wanted is None else {"aovs": channels.aov_list(wanted, option)}
+        added = {} if wanted is None else {"aovs": channels.aov_list(wanted)}
         if added and self.aovs is None:
             added["aovs"] = Wish(added["aovs"])
         if self.light_groups is not None:

@@ -13,7 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument, typed
 from manylights.loading import LoadedScene, light_groups
 from manylights.output import images
 from manylights.rendering import plan as plans
@@ -232,16 +232,20 @@ def _check_groups(driver: Driver) -> None:
         backend, mono, _ = mi.variant().partition("_mono")
         if mono:
             # Mitsuba's films have luminance there, whatever they are told
-            what, todo = f"has no colours in {mi.variant()}", f"--variant {backend}_rgb has them"
+            what, todo = (
+                f"has no colours in {mi.variant()}",
+                f"{typed('the variant', '--variant')} {backend}_rgb has them",
+            )
         raise UsageError(
-            f"light groups: the film {what}, layers need pixel_format rgb or rgba: {todo}"
+            f"{argument('light_groups')}: the film {what}, layers need pixel_format rgb or rgba: "
+            f"{todo}"
         )
 
 
 def check(name: str, value, allowed: bool, what: str) -> None:
     """Raise ``UsageError`` with name, value and what it must be, unless it is allowed."""
     if not allowed:
-        raise UsageError(f"{name} {value}: must be {what}")
+        raise UsageError(f"{argument(name)} {value}: must be {what}")
 
 
 def _digests(paths: list[Path]) -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, typed
 from manylights.output import channels, images, light_groups
 from manylights.output import denoise as denoising
 from manylights.rendering import metadata, state_file
@@ -166,7 +166,8 @@ class _Parts:
         missing = gaps(runs, self.steps)
         words = missing.words(self.steps)
         if missing and not partial:
-            raise UsageError(f"missing: {words}{self._remedy(missing)} (--partial does without)")
+            option = typed("partial=True", "--partial")
+            raise UsageError(f"missing: {words}{self._remedy(missing)} ({option} does without)")
         state, samples = self.state, self.state.history.spp
         if not samples:
             raise UsageError(f"{self.first.path}: no samples yet, missing: {words}")

@@ -9,7 +9,7 @@ from typing import Union
 
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
 from manylights.output import channels, exr, images, light_groups
 
 #: What is true of the image as it was rendered alone.
@@ -89,7 +89,7 @@ def _check_file(path: Path, groups: list[str], attributes: dict) -> None:
     if f"{exr.OURS}channels" in attributes:
         raise UsageError(f"{path}: a part or checkpoint, merge all parts of the render first")
     if not groups:
-        raise UsageError(f"{path}: no light groups, render it with --light-groups")
+        raise UsageError(f"{path}: no light groups, render it with {argument('light_groups')}")
 
 
 def _factors(name: str, weight: Weight) -> list[np.float32]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from manylights import loading
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
 from manylights.output import channels, images
 from manylights.rendering import checkpoint as checkpoints
 from manylights.rendering import metadata, state_file
@@ -144,7 +144,9 @@ def render(
 
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
     """Return the facts that files need, and the state that the render goes on from."""
-    check("learnt", learnt, learnt is None or job.part is not None, "given with part")
+    check(
+        "learnt", learnt, learnt is None or job.part is not None, f"given with {argument('part')}"
+    )
     # Before the render, which may change the scene's parameters.
     facts = store.facts if store else job.facts() if target or learnt else {}
     state = (store and store.restore()) or State.empty(job.course.sequences)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from manylights.errors import one_line
+from manylights.errors import one_line, typed
 from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
 from manylights.loading.light_groups import PARAMETER, as_text
 from manylights.loading.parsing import MOST_SUBDIVISION, UsdOptions
@@ -222,8 +222,8 @@ def _without_light(context: Context, scene: SceneDict, default_light: bool) -> N
         radiance = {"type": "rgb", "value": [1.0, 1.0, 1.0]}
         scene["environment"] = {"type": "constant", "radiance": radiance}
     else:
-        text = "the stage has no light: the image is black without --default-light"
-        text += " (default_light=True)"
+        option = typed("default_light=True", "--default-light")
+        text = f"the stage has no light: the image is black without {option}"
     context.notes.add("no light", text, "/")
 
 
