@@ -158,9 +158,9 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
 
     Args:
         state: the scene as ``mi.parser.parse_file`` returns it, before any transformation.
-        wanted: ``None`` replaces as ``REPLACEMENTS`` says, and ``path``, which Mitsuba uses if the
-            scene names no integrator, like the others; ``"keep"`` replaces nothing; any other text
-            is the plugin to use for every integrator that nests no other.
+        wanted: ``None`` replaces as ``REPLACEMENTS`` says, a scene without an integrator as one
+            with ``path``; ``"keep"`` replaces nothing; any other text is the plugin to use for
+            every integrator that nests no other.
         settings: parameters to set on each of those integrators.
 
     Returns:
@@ -179,7 +179,7 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
             notes.extend(_replace(state, node.props, wanted))
     if settings and not leaves:
         name = next(iter(settings))
-        raise UsageError(f"{_parameter(name)}: the scene has no integrator, name one{_by_name()}")
+        raise UsageError(f"{_parameter(name)}: the scene has no integrator, name one{by_name()}")
     for node in leaves:
         _apply(node.props, settings)
     return notes
@@ -233,9 +233,9 @@ def _nests_integrator(node, state) -> bool:
 
 
 def _without_integrator(state, wanted: str | None) -> tuple[list, list[str]]:
-    """Handle a scene that names no integrator; Mitsuba would use ``path``."""
+    """Handle a scene that names no integrator as one that names ``path``."""
     if wanted == "keep":
-        return [], ["integrator: the scene names none, Mitsuba uses path"]
+        return [], []
     chosen = wanted or REPLACEMENTS["path"]
     node = mi.parser.SceneNode()
     node.type = mi.ObjectType.Integrator
@@ -256,9 +256,7 @@ def _replace(state, props, wanted: str | None) -> list[str]:
     new = wanted or REPLACEMENTS.get(old, old)
     if old == new:
         stays = (
-            f"{STAYS[old]}{_by_name(VOLPATH, ' uses it')}"
-            if wanted is None and old in STAYS
-            else ""
+            f"{STAYS[old]}{by_name(VOLPATH, ' uses it')}" if wanted is None and old in STAYS else ""
         )
         return [f"integrator: {old}{_listed(props)}{stays}"]
     notes = []
@@ -276,10 +274,10 @@ def _replace(state, props, wanted: str | None) -> list[str]:
 
 
 def _undo(wanted: str | None) -> str:
-    return _by_name("keep", " undoes it") if wanted is None else ""
+    return by_name("keep", " undoes it") if wanted is None else ""
 
 
-def _by_name(name: str = "NAME", does: str = "") -> str:
+def by_name(name: str = "NAME", does: str = "") -> str:
     """Return how the user chooses an integrator, and what that does, in brackets."""
     how = typed(f'integrator="{name}"', f"--integrator {name}")
     return f" ({how}{does})"
@@ -338,7 +336,7 @@ def _apply(props, settings: dict[str, Any]) -> None:
         else:
             known = " or ".join(PARAMETERS)
             raise UsageError(
-                f"{argument('aovs')}: {plugin} shows no surfaces, {known} do{_by_name()}"
+                f"{argument('aovs')}: {plugin} shows no surfaces, {known} do{by_name()}"
             )
     for name, value in settings.items():
         if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
@@ -346,7 +344,7 @@ def _apply(props, settings: dict[str, Any]) -> None:
             raise UsageError(f"{_parameter(name)}: {plugin} has no such parameter. It has: {known}")
         if name == light_groups.PARAMETER and plugin not in PARAMETERS:
             known = " and ".join(PARAMETERS)
-            raise UsageError(f"{argument(name)}: {plugin} has none, {known} have{_by_name()}")
+            raise UsageError(f"{argument(name)}: {plugin} has none, {known} have{by_name()}")
         props[name] = value
 
 
