@@ -516,6 +516,20 @@ def test_wrong_weights_are_refused(image, tmp_path, capsys, words, text):
     assert not (tmp_path / "mixed.exr").exists()
 
 
+def test_weights_of_wrong_types_are_refused(image):
+    for weights in (None, "key=2", [("key", 2)]):
+        with pytest.raises(UsageError, match="must be a dictionary of factors by group"):
+            manylights.mix(image, weights)
+    for weight in ("2", None, ["a", "b", "c"], [1, 2], np.ones(2), np.ones((3, 3)), {1: 2}):
+        with pytest.raises(UsageError, match=r"^key=.*must be one or three finite numbers"):
+            manylights.mix(image, {"key": weight})
+    with pytest.raises(UsageError, match="path 3: must be a path"):
+        manylights.mix(3, {"key": 1})
+    listed = manylights.mix(image, {"key": [1, 2, 3]}).image
+    for weight in (np.array([1, 2, 3]), np.array([1, 2, 3], np.float32)):
+        np.testing.assert_array_equal(manylights.mix(image, {"key": weight}).image, listed)
+
+
 def test_other_files_are_refused(scalar, tmp_path, capsys):
     target = tmp_path / "mixed.exr"
     foreign, plain, missing = (tmp_path / f"{name}.exr" for name in ("foreign", "plain", "missing"))

@@ -161,7 +161,9 @@ def test_part_that_is_none_is_refused(run, capsys, wrong):
 
 @pytest.mark.parametrize("wrong", [(0, 4), (5, 4), (1,), 3, (1.0, 4), (True, 4), "3/4"])
 def test_part_in_python_that_is_none_is_refused(scene, scalar, wrong):
-    with pytest.raises(UsageError, match=r"must be two integers, \(3, 16\) is the third of 16"):
+    with pytest.raises(
+        UsageError, match=r"must be two integers, 1 <= K <= N <= 1048576, \(3, 16\) is"
+    ):
         manylights.render(str(scene), part=wrong)
 
 
@@ -506,6 +508,20 @@ def test_other_images_are_no_parts(run, two, tmp_path):
     status, log = run.merge(two[0], other)
     assert status == 2 and f"{other}: not a part or image of manylights" in log
     assert f"{tmp_path}/nothing.exr: no such file" in run.merge(tmp_path / "nothing.exr")[1]
+
+
+@pytest.mark.parametrize(
+    ("paths", "words"),
+    [
+        ("a.exr", "paths 'a.exr': must be a list of paths"),
+        (None, "paths None: must be a list of paths"),
+        ([3], "paths 3: must be a path"),
+        (["a.exr"], "^a.exr: no such file$"),
+    ],
+)
+def test_what_are_no_paths_is_named(scalar, paths, words):
+    with pytest.raises(UsageError, match=words):
+        manylights.merge(paths)
 
 
 def test_renders_with_a_target_are_no_parts(run, monkeypatch, tmp_path):

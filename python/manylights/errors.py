@@ -1,10 +1,13 @@
-"""Errors that the command line shows as one line, and what it calls the arguments of functions."""
+"""Errors of users, which the command shows as one line: what they typed, and what is allowed."""
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from numbers import Integral, Real
+from typing import Any
 
 #: Options that are not called as the arguments are in Python.
 OPTIONS = {
@@ -14,6 +17,9 @@ OPTIONS = {
     "seconds": "--for",
     "client": "--workers",
 }
+
+#: Characters of a value in a message, at most.
+MOST_SHOWN = 60
 
 _in_shell = False
 
@@ -51,3 +57,43 @@ def typed(python: str, shell: str) -> str:
 def argument(name: str) -> str:
     """Return what the user calls an argument: ``light_groups``, or ``--light-groups``."""
     return typed(name, OPTIONS.get(name, f"--{name.replace('_', '-')}"))
+
+
+def shown(value: Any) -> str:
+    """Return a value as the user typed it, on one line that is not too long."""
+    plain = _in_shell or isinstance(value, os.PathLike)
+    text = " ".join((str(value) if plain else repr(value)).split())
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
+
+
+def check(name: str, value: Any, allowed: bool, what: str) -> None:
+    """Raise ``UsageError`` with argument, value and what it must be, unless it is allowed."""
+    if not allowed:
+        raise UsageError(f"{argument(name)} {shown(value)}: must be {what}")
+
+
+def is_integer(value: Any) -> bool:
+    """Is it an integer of any kind, as of NumPy, and not True or False?"""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def integer(name: str, value: Any, least: int, most: int) -> int:
+    """Return an integer of any kind as one of Python.
+
+    Raises:
+        UsageError: none, or one that is not in ``least`` to ``most``.
+    """
+    allowed = is_integer(value) and least <= int(value) <= most
+    check(name, value, allowed, f"an integer from {least} to {most}")
+    return int(value)
+
+
+def number(name: str, value: Any, allowed: Callable[[Any], bool], what: str) -> float:
+    """Return a real number of any kind, as of NumPy, as one of Python.
+
+    Raises:
+        UsageError: none, as ``True``, or one that is not allowed; ``what`` says which are.
+    """
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    check(name, value, real and allowed(value), what)
+    return float(value)

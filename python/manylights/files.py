@@ -9,7 +9,17 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from manylights.errors import UsageError, argument
+from manylights.errors import UsageError, argument, check
+
+
+def path_of(name: str, value: str | Path) -> Path:
+    """Return the path that an argument is.
+
+    Raises:
+        UsageError: something else.
+    """
+    check(name, value, isinstance(value, (str, os.PathLike)), "a path")
+    return Path(value)
 
 
 def check_output(path: str, kind: str = "", ending: str = "", named: bool = True) -> Path:

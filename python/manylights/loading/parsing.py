@@ -12,7 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError, argument, one_line
+from manylights.errors import UsageError, argument, one_line, shown
 
 #: Endings of USD stages: whichever format, in text, binary, and packed.
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -82,8 +82,9 @@ def parse(
         RuntimeError: Mitsuba cannot read it.
     """
     if not Path(path).is_file():
-        what = "is a folder, not a scene" if Path(path).is_dir() else "no such file"
-        raise UsageError(f"{path}: {what}")
+        folder = path and Path(path).is_dir()
+        what = "is a folder, not a scene" if folder else "no such file"
+        raise UsageError(f"{path or shown(path)}: {what}")
     if Path(path).suffix.lower() in IMAGE_ENDINGS:
         raise UsageError(f"{path}: is an image, not a scene (an XML file or a USD stage)")
     if Path(path).suffix.lower() in USD_ENDINGS:

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError, argument, one_line
+from manylights.errors import UsageError, argument, check, one_line
 from manylights.output import exr
 from manylights.threads import threads_for_files
 
@@ -88,7 +88,9 @@ def aov_list(names: str | Sequence[str]) -> str:
     Raises:
         UsageError: an unknown name, or one that comes twice.
     """
-    words = names.split(",") if isinstance(names, str) else list(names)
+    listed = isinstance(names, (str, list, tuple))
+    check("aovs", names, listed, "a text with commas between names, or a list of them")
+    words = names.split(",") if isinstance(names, str) else names
     words = [str(word).strip() for word in words]
     for index, word in enumerate(words):
         if word not in AOVS and ":" not in word:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from manylights.errors import argument, typed
+from manylights.errors import argument, check, typed
 from manylights.loading import light_groups
 from manylights.loading.integrators import Wish
 from manylights.output import channels, images
 from manylights.output import denoise as denoising
 from manylights.rendering import live
-from manylights.rendering.job import Job, check
+from manylights.rendering.job import Job
 from manylights.rendering.state import State
 
 
@@ -61,6 +61,8 @@ class Extras:
                 raise TypeError(f"render() got an unexpected keyword argument {name!r}")
         extras = Extras(**arguments)
         images.check_stops(extras.exposure)
+        tev = extras.tev
+        check("tev", tev, tev is None or isinstance(tev, str), "a text, HOST:PORT")
         for name in ("denoise", "exposure"):
             value = getattr(extras, name)
             whole = not value or part is None

@@ -13,7 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError, argument, typed
+from manylights.errors import UsageError, argument, integer, number, typed
 from manylights.loading import LoadedScene, light_groups
 from manylights.output import images
 from manylights.rendering import plan as plans
@@ -87,11 +87,10 @@ class Job:
         sensors = loaded.scene.sensors()
         if not sensors:
             raise UsageError("the scene has no sensor")
-        check("sensor", sensor, 0 <= sensor < len(sensors), f"0 to {len(sensors) - 1}")
-        check("spp", spp, spp is None or 1 <= spp < 2**32, "1 to 4294967295")
-        check("seed", seed, 0 <= seed < 2**32, "0 to 4294967295")
-        for name, value in (("until_noise", noise), ("seconds", seconds)):
-            check(name, value, value is None or 0.0 < value < np.inf, "a number above 0")
+        sensor = integer("sensor", sensor, 0, len(sensors) - 1)
+        spp = None if spp is None else integer("spp", spp, 1, 2**32 - 1)
+        seed = integer("seed", seed, 0, 2**32 - 1)
+        noise, seconds = _target("until_noise", noise), _target("seconds", seconds)
         driver = Driver(loaded, sensors[sensor], integrator)
         _check_film(driver)
         _check_groups(driver)
@@ -242,10 +241,11 @@ def _check_groups(driver: Driver) -> None:
         )
 
 
-def check(name: str, value, allowed: bool, what: str) -> None:
-    """Raise ``UsageError`` with name, value and what it must be, unless it is allowed."""
-    if not allowed:
-        raise UsageError(f"{argument(name)} {value}: must be {what}")
+def _target(name: str, value) -> float | None:
+    """Return a noise or a time that was asked for, None for none."""
+    if value is None:
+        return None
+    return number(name, value, lambda number: 0.0 < number < np.inf, "a number above 0")
 
 
 def _digests(paths: list[Path]) -> dict[str, str]:

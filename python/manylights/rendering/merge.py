@@ -14,7 +14,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError, typed
+from manylights import files
+from manylights.errors import UsageError, check, typed
 from manylights.output import channels, images, light_groups
 from manylights.output import denoise as denoising
 from manylights.rendering import metadata, state_file
@@ -23,6 +24,7 @@ from manylights.rendering.job import FILMS, STATE, differences
 from manylights.rendering.parts import gaps, steps_of
 from manylights.rendering.state import State
 from manylights.rendering.state_file import Saved
+from manylights.threads import require_variant
 
 #: Formats of pixels by the channels of an image, those of the integrator left out.
 FORMATS = {
@@ -84,11 +86,14 @@ def merge(
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
             that comes twice, or one that is missing and ``partial`` is not set.
     """
+    require_variant()
     target = None if output is None else images.check_output(str(output))
     images.check_stops(exposure)
     if denoise:
         denoising.check_installed()
-    paths = [Path(path) for path in paths]
+    listed = isinstance(paths, Iterable) and not isinstance(paths, (str, bytes))
+    check("paths", paths, listed, "a list of paths")
+    paths = [files.path_of("paths", path) for path in paths]
     if not paths:
         raise UsageError("nothing to merge: no files")
     first, bitmap = state_file.read(paths[0], WHAT, "")

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Union
 
 import numpy as np
 
-from manylights.errors import UsageError, argument
+from manylights import files
+from manylights.errors import UsageError, argument, check
 from manylights.output import channels, exr, images, light_groups
+from manylights.threads import require_variant
 
 #: What is true of the image as it was rendered alone.
 OF_THE_RENDER = (channels.VARIANCE, channels.DENOISED)
@@ -58,10 +61,14 @@ def mix(
         UsageError: (a ``ValueError``) no render of ours, no such group, a wrong weight.
     """
     target = None if output is None else images.check_output(str(output))
+    if target is not None:
+        require_variant()
     images.check_stops(exposure)
+    path = files.path_of("path", path)
+    check("weights", weights, isinstance(weights, Mapping), "a dictionary of factors by group")
     planes, attributes = exr.read(path)
     groups = light_groups.groups(planes)
-    _check_file(Path(path), groups, attributes)
+    _check_file(path, groups, attributes)
     factors = {name: _factors(name, weight) for name, weight in weights.items()}
     for name in factors:
         if name not in groups:
@@ -94,10 +101,11 @@ def _check_file(path: Path, groups: list[str], attributes: dict) -> None:
 
 def _factors(name: str, weight: Weight) -> list[np.float32]:
     """Return a weight as three numbers in single precision."""
+    weight = weight.tolist() if isinstance(weight, np.ndarray) else weight
     numbers = list(weight) if isinstance(weight, Sequence) else [weight] * 3
     largest = float(np.finfo(np.float32).max)
-    wrong = len(numbers) != 3 or isinstance(weight, str)
-    if wrong or not all(0.0 <= number <= largest for number in numbers):
+    real = len(numbers) == 3 and all(isinstance(number, Real) for number in numbers)
+    if not real or not all(0.0 <= number <= largest for number in numbers):
         raise UsageError(f"{name}={weight}: must be one or three finite numbers of at least 0")
     return [np.float32(number) for number in numbers]
 

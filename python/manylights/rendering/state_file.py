@@ -92,6 +92,8 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, dict[str, np.ndar
     Raises:
         UsageError: not such a file, or not a whole one.
     """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
     try:
         planes, attributes = exr.read(path)
         facts = {
@@ -103,7 +105,8 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, dict[str, np.ndar
             return _saved(path, planes, facts), planes
     except (UsageError, ValueError, KeyError, TypeError, AttributeError, zlib.error) as error:
         what = f"{type(error).__name__}: " if isinstance(error, (KeyError, TypeError)) else ""
-        text = f"{path}: not a whole {prefix}{remedy} ({what}{one_line(error)})"
+        reason = one_line(error).removeprefix(f"{path}: ")
+        text = f"{path}: not a whole {prefix}{remedy} ({what}{reason})"
         raise UsageError(text) from error
     raise UsageError(f"{path}: not a {prefix} of manylights{remedy}")
 
