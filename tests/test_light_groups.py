@@ -475,6 +475,25 @@ def test_a_mix_is_exact(image, tmp_path):
         manylights.merge([image, target])
 
 
+def test_a_mix_keeps_what_it_does_not_change(scalar, tmp_path):
+    """Layers of surfaces, samples, the camera; not what lamps in sight emit."""
+    target, kept = tmp_path / "out.exr", "albedo,normal,depth"
+    manylights.render(
+        stage() | all_lights(), spp=2, output=target, light_groups=GROUPS, aovs=f"{kept},emission"
+    )
+    mixed = manylights.mix(target, {"key": 0}, tmp_path / "mixed.exr")
+    assert mixed.notes == ["left out, since it is that of the render: emission"]
+    before, told = exr.read(target)
+    after, said = exr.read(tmp_path / "mixed.exr")
+    assert before.keys() - after.keys() == {f"emission.{color}" for color in "RGB"}
+    assert not after["RGBA_key.R"].any() and (after["R"] != before["R"]).any()
+    for name in after.keys() - {"R", "G", "B", "RGBA_key.R", "RGBA_key.G", "RGBA_key.B"}:
+        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
+    assert said.keys() - told.keys() == {"manylights.mix"} and not told.keys() - said.keys()
+    for name in told:
+        np.testing.assert_array_equal(told[name], said[name], err_msg=name)
+
+
 def test_weights_of_one_leave_every_bit(image):
     planes, _ = exr.read(image)
     mixed = manylights.mix(image, {"key": 1.0})

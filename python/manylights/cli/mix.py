@@ -27,7 +27,7 @@ named stay as they are; manylights info IMAGE.exr lists them.
 
 All is exact, in single precision: each layer is multiplied, and the image is the sum of the
 layers in the order of their names. The output has the layers, too, and can be mixed again.
-What belongs to the render alone (variance, a denoised image) is left out.
+What belongs to the render alone (variance, emission, a denoised image) is left out.
 """
 
 

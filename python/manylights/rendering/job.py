@@ -27,7 +27,7 @@ FORMAT = 3
 
 #: Facts in files about what was rendered so far.
 STATE = ("history", "channels", "shown", "learnt", "sequences", "runs", "processors", "command")
-STATE += ("samples_done", "checksum", "seeds", "noise")
+STATE += ("samples_done", "checksum", "seeds", "samples", "seconds_taken", "parameters", "noise")
 
 #: Films that can be made anew from what a file says, to develop the sums of parts.
 FILMS = ("HDRFilm",)

@@ -182,14 +182,19 @@ class _Parts:
             return merged
         if missing:
             facts = {**self.facts, "part": MERGED}
-            saved = Saved(target, facts, runs, state, self.first.shown, self.first.command)
+            first, standard = self.first, self._standard()
+            saved = Saved(target, facts, runs, state, first.shown, first.command, standard)
             previews, notes = images.write_preview(bitmap, target, stops=stops)
             merged.files = [state_file.write(saved), *previews]
         else:
-            seeds = [self.facts["seed"]]
-            notes = _write(merged, target, {}, self.facts, seeds, denoise, stops)
+            told = self._standard() | _own(merged, self.facts, state.history.seconds)
+            facts = {**self.facts, "seeds": [self.facts["seed"]]}
+            notes = _write(merged, target, {}, facts, told, denoise, stops)
         merged.notes += notes
         return merged
+
+    def _standard(self) -> dict[str, Any]:
+        return metadata.shared(saved.standard for saved in self.files)
 
     def _remedy(self, missing) -> str:
         """Return how to render what is missing."""
@@ -230,10 +235,16 @@ def _developed(saved: Saved, state: State):
     return develop(film, state.total(facts["adjoint"]), facts["exposure"])[1]
 
 
-def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
+def _signature(facts: dict, samples: int) -> dict[str, str]:
     """Return what a finished render says of itself."""
     own = {name: facts[name] for name in facts if name not in STATE}
-    return state_file.signature({**own, "part": "1/1", "seeds": seeds}, samples)
+    return state_file.signature({**own, "part": "1/1", "seeds": facts["seeds"]}, samples)
+
+
+def _own(merged: Merged, facts: dict, seconds: float) -> dict[str, Any]:
+    """Return what it says beside facts; files of before may lack the integrator's parameters."""
+    told = metadata.own(merged.samples, seconds, facts.get("parameters", ""))
+    return {name: value for name, value in told.items() if value != ""}
 
 
 def _write(
@@ -241,11 +252,20 @@ def _write(
     target: Path,
     layers: dict,
     facts: dict,
-    seeds: list[int],
+    told: dict[str, Any],
     denoise: bool,
     stops: float,
 ) -> list[str]:
-    """Write the image of finished parts or images; return notes about that."""
+    """Write the image of finished parts or images; return notes about that.
+
+    Args:
+        merged: the image.
+        target: of the file.
+        layers: further channels.
+        facts: of the job, with the ``seeds``.
+        told: other attributes of the file.
+        denoise, stops: arguments of :func:`merge`.
+    """
     names, shown = channels.names(merged.bitmap), None
     if denoise:
         pixels = np.array(merged.bitmap, copy=False).reshape(*merged.bitmap.size()[::-1], -1)
@@ -255,7 +275,7 @@ def _write(
         pixels = np.concatenate(planes, axis=2)
         shown = denoising.denoised(pixels, [*names, *guides], float(facts["exposure"]))
         layers = layers | channels.color_layers(channels.DENOISED, shown)
-    own = _signature(facts, seeds, merged.samples)
+    own = _signature(facts, merged.samples) | told
     number = np.float16 if facts["number"] == "float16" else np.float32
     merged.files, notes = images.write_images(
         merged.bitmap, target, layers, own, number, merged.samples, shown, stops
@@ -273,6 +293,7 @@ def _merge_images(
 ) -> Merged:
     """Return the mean of finished images."""
     facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
+    standards, seconds = [first.standard], facts.get("seconds_taken", 0.0)
     names = [name for name in planes if channels.is_averaged(name)]
     # The variance of a mean: weights are squared
     powers = {name: 2 if name.startswith(channels.VARIANCE) else 1 for name in names}
@@ -283,6 +304,8 @@ def _merge_images(
             saved, planes = state_file.read(path, WHAT, "")
             found = [name for name in planes if channels.is_averaged(name)]
             _check_image(saved, found, first, names, owners)
+            standards.append(saved.standard)
+            seconds += saved.facts.get("seconds_taken", 0.0)
         weight = saved.facts["samples_done"]
         for name in names:
             total[name] += planes[name].astype(np.float64) * float(weight) ** powers[name]
@@ -298,7 +321,9 @@ def _merge_images(
     text = f"images: the mean of {count}, weighted by samples; their sums are not in the files"
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
-        merged.notes += _write(merged, target, layers, facts, sorted(owners), denoise, stops)
+        told = metadata.shared(standards) | _own(merged, facts, seconds)
+        facts = {**facts, "seeds": sorted(owners)}
+        merged.notes += _write(merged, target, layers, facts, told, denoise, stops)
     return merged
 
 
@@ -310,7 +335,7 @@ def _check_image(saved: Saved, names, first: Saved, expected, owners: dict[int, 
             "render first, then the images"
         )
     changes = differences(
-        saved.facts, first.facts, but=("part", "seed", "spp", "step_count", "steps", *metadata.OWN)
+        saved.facts, first.facts, but=("part", "seed", "spp", "step_count", "steps")
     )
     if changes:
         text = "; ".join(changes)

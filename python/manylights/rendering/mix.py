@@ -12,11 +12,12 @@ import numpy as np
 
 from manylights import files
 from manylights.errors import UsageError, argument, check
-from manylights.output import channels, exr, images, light_groups
+from manylights.output import channels, denoise, exr, images, light_groups
 from manylights.threads import require_variant
 
-#: What is true of the image as it was rendered alone.
-OF_THE_RENDER = (channels.VARIANCE, channels.DENOISED)
+#: What is true of the image as it was rendered alone. Which group a lamp in sight is of, whose
+#: emission a layer has, is not in the file.
+OF_THE_RENDER = (channels.VARIANCE, channels.DENOISED, f"{denoise.EMISSION}.")
 
 #: Facts about it that are not those of a mix.
 OWN_FACTS = ("noise",)
