@@ -1,6 +1,7 @@
 """Light groups: layers that sum to the image, and are what their lamps alone would give; mixes."""
 
 import itertools
+import re
 from types import SimpleNamespace
 
 import manylights
@@ -248,6 +249,34 @@ def test_a_group_without_lights_is_an_error(scalar, groups):
             mi.load_dict(stage() | bulbs(1) | lamps(2)),
             {"type": "manylights_direct", "light_groups": groups},
         )
+
+
+NAMELESS = """<scene version="3.0.0">
+    <sensor type="perspective"><film type="hdrfilm">
+        <integer name="width" value="4"/><integer name="height" value="4"/>
+        <string name="pixel_format" value="rgb"/>
+    </film></sensor>
+    <shape type="sphere"><point name="center" value="3, 0, 0"/><emitter type="area"/></shape>
+    <emitter type="constant"/>
+</scene>
+"""
+
+
+def test_lights_without_ids_are_told(scalar, tmp_path, capsys):
+    path = tmp_path / "scene.xml"
+    path.write_text(NAMELESS)
+    words = "light_groups key=lamp_*: no light of the scene has an id, nor has its shape, give"
+    with pytest.raises(UsageError, match=re.escape(words)):
+        manylights.render(path, spp=1, light_groups="key=lamp_*")
+    command = ["render", str(path), "-o", str(tmp_path / "o.exr"), "--variant", "scalar_rgb"]
+    assert cli.main([*command, "--light-groups", "key=lamp_*"]) == 2
+    assert "manylights: --light-groups key=lamp_*: no light of the" in capsys.readouterr().err
+    # All of them are a group all the same
+    assert manylights.render(path, spp=1, light_groups="all=*").image.any()
+    path.write_text(NAMELESS.replace('"constant"', '"constant" id="sky"'))
+    assert manylights.render(path, spp=1, light_groups="key=sky").image.any()
+    assert cli.main([*command, "--light-groups", "key=moon"]) == 2
+    assert 'manylights: in the parameter "light_groups", "key=moon"' in capsys.readouterr().err
 
 
 def test_sixteen_groups_are_allowed_and_no_lights_at_all_need_none(scalar):

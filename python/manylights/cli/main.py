@@ -86,7 +86,8 @@ def main(arguments: list[str] | None = None) -> int:
     except Exception as error:
         if options.debug:
             raise
-        print(f"manylights: {one_line(error)}", file=sys.stderr)
+        text = one_line(error).removeprefix("manylights: ")
+        print(f"manylights: {text}", file=sys.stderr)
         return FAILURE
 
 

@@ -221,11 +221,14 @@ def _check_film(driver: Driver) -> None:
 
 
 def _check_groups(driver: Driver) -> None:
-    """Raise ``UsageError`` if light groups are asked for and the film has no colours."""
+    """Raise ``UsageError`` if light groups are asked for and film or lights cannot have them."""
+    groups = light_groups.of_integrator(driver.integrator)
+    if not groups:
+        return
     film = driver.sensor.film()
     known = re.search(r"pixel_format = (\w+)", str(film))
     plain = film.class_name() in FILMS and known and known[1] in ("rgb", "rgba")
-    if light_groups.of_integrator(driver.integrator) and not plain:
+    if not plain:
         what = f"has pixel_format {known[1]}" if known else f"is a {film.class_name()}"
         todo = 'type <string name="pixel_format" value="rgb"/> in an hdrfilm'
         backend, mono, _ = mi.variant().partition("_mono")
@@ -238,6 +241,11 @@ def _check_groups(driver: Driver) -> None:
         raise UsageError(
             f"{argument('light_groups')}: the film {what}, layers need pixel_format rgb or rgba: "
             f"{todo}"
+        )
+    if light_groups.entry_of(groups, "") is None and not light_groups.are_named(driver.scene):
+        raise UsageError(
+            f"{argument('light_groups')} {groups}: no light of the scene has an id, nor has its "
+            'shape, give them some: <emitter type="point" id="lamp_1">'
         )
 
 
