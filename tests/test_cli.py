@@ -483,7 +483,8 @@ def test_convert_names_its_output_as_it_was_typed(capsys):
 
 
 def test_unknown_scene_parameter(scene, tmp_path):
-    assert_fails(manylights("render", scene, "-o", tmp_path / "o.exr", "-D", "sky=1"), "sky")
+    process = manylights("render", scene, "-o", tmp_path / "o.exr", "-D", "sky=1")
+    assert_fails(process, f"manylights: -D sky: {scene} has no <default> of this name")
 
 
 def test_unknown_variant(scene, tmp_path):

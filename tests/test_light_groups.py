@@ -554,7 +554,7 @@ def test_a_mix_is_the_render_with_other_lamps(scalar, tmp_path):
         (("key=-1",), "one or three finite numbers"),
         (("key=inf",), "one or three finite numbers"),
         (("key=1e39",), "one or three finite numbers"),
-        (("key",), "mix key: write it as"),
+        (("key",), "group key: write it as NAME=VALUE"),
         (("key=1", "key=2"), "given twice"),
     ],
 )

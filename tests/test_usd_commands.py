@@ -144,7 +144,8 @@ def test_lamps_of_converted_stage_keep_their_colours(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--camera", "/World/nowhere"], "/World/nowhere"),
+        (["--camera", "/World/nowhere"], "--camera /World/nowhere: no such prim; the stage has"),
+        (["--light-groups", "key=/Nowhere"], '--light-groups: "key=/Nowhere" matches no light'),
         (["--time", "noon"], "--time noon: must be a number"),
         (["--subdivision", "9"], "--subdivision 9: must be an integer from 0 to 6"),
         (["-D", "spp=4"], "-D spp"),

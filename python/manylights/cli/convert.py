@@ -31,7 +31,7 @@ def add(commands, common) -> None:
     parser.add_argument("stage", metavar="STAGE", help="USD stage")
     parser.add_argument("output", metavar="OUT.xml", help="file to write")
     shared.add_usd(parser)
-    parser.add_argument("--variant", default="scalar_rgb", help="(default: scalar_rgb)")
+    shared.add_scalar_variant(parser)
     parser.set_defaults(command=_run)
 
 

@@ -52,7 +52,7 @@ def add(commands, common) -> None:
 def _run(options) -> None:
     mi.set_variant("scalar_rgb")
     images.check_output(options.output)
-    texts = integrators.parse_assignments(options.weights, "mix")
+    texts = integrators.parse_assignments(options.weights, "group")
     if len(texts) < len(options.weights):
         raise UsageError("mix: a group is given twice")
     weights = {name: _weight(name, text) for name, text in texts.items()}

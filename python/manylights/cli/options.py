@@ -61,6 +61,12 @@ def add_usd(parser) -> None:
     )
 
 
+def add_scalar_variant(parser) -> None:
+    """Add the variant of a command that renders next to nothing."""
+    what = "Mitsuba's variant (default: scalar_rgb)"
+    parser.add_argument("--variant", default="scalar_rgb", help=what)
+
+
 def add_machine(parser) -> None:
     """Add what a render is done with: seed, variant, threads."""
     group = parser.add_argument_group("random numbers and machine")

@@ -148,7 +148,7 @@ def parse_assignments(items: list[str], option: str) -> dict[str, str]:
     for item in items:
         name, separator, value = item.partition("=")
         if not separator or not name:
-            raise UsageError(f"{option} {item}: write it as {option} name=value")
+            raise UsageError(f"{option} {item}: write it as NAME=VALUE")
         result[name] = value
     return result
 

@@ -6,6 +6,7 @@ The ending of the file's name chooses the reader; after it XML and USD go the sa
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,14 @@ def parse(
         if given != known.default and known.name != "light_groups":
             raise UsageError(f"{argument(known.name)}: {path} is XML, that is for USD stages")
     config = mi.parser.ParserConfig(mi.variant())
-    state = mi.parser.parse_file(config, str(path), **(defines or {}))
+    try:
+        state = mi.parser.parse_file(config, str(path), **(defines or {}))
+    except RuntimeError as error:
+        unused = re.findall(r"\$(\w+)=", str(error)) if "unused parameters" in str(error) else []
+        if not unused:
+            raise
+        names, defined = ", ".join(unused), argument("defines")
+        raise UsageError(f"{defined} {names}: {path} has no <default> of this name") from error
     mi.parser.transform_upgrade(config, state)
     return ParsedScene(config, state, files_of(state))
 
