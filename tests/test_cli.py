@@ -294,6 +294,71 @@ def test_unknown_parameters_are_refused_with_those_of_the_integrator(choose, plu
         assert listed in str(raised.value) and f"{wrong} (" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("reservoirs", "many", "an integer from 1 to 64"),
+        ("reservoirs", 2.0, "an integer from 1 to 64"),
+        ("reservoirs", True, "an integer from 1 to 64"),
+        ("reservoirs", None, "an integer from 1 to 64"),
+        ("splitting_rate", "many", "a float >= 0 or inf"),
+        ("counts", 1, "true or false"),
+        ("counts", "true", "true or false"),
+        ("learn_visibility", "no", "true, false or keep"),
+        ("method", 3, "resampled_tree, talk, adaptive_splitting, tree or exhaustive"),
+    ],
+)
+def test_parameters_of_wrong_types_are_named(choose, name, value, allowed):
+    with pytest.raises(UsageError) as raised:
+        choose(integrator("manylights_direct"), **{name: value})
+    assert str(raised.value) == f'integrator["{name}"] {value!r}: must be {allowed}'
+
+
+def test_parameters_of_right_types_are_taken(choose):
+    right = {"reservoirs": np.int64(8), "splitting_rate": 2, "counts": True, "aovs": "Z:depth"}
+    right |= {"learn_visibility": "keep", "method": "tree", "hide_emitters": np.bool_(True)}
+    _, parameters, _ = choose(integrator("manylights_direct"), **right)
+    assert parameters == right
+    for rate in ("inf", float("inf"), np.float32(0.5), 0):
+        _, parameters, _ = choose(integrator("manylights_direct"), splitting_rate=rate)
+        assert parameters == {"splitting_rate": rate}
+
+
+def test_channels_for_the_denoiser_are_added_to_those_of_the_scene(choose):
+    """Those of another type under a wanted name stay."""
+    wish = integrators.Wish("albedo:albedo,normal:sh_normal")
+    for own, all_of_them in (
+        ("Z:depth", "Z:depth,albedo:albedo,normal:sh_normal"),
+        ("Z:depth, normal:geo_normal", "Z:depth, normal:geo_normal,albedo:albedo"),
+        (None, "albedo:albedo,normal:sh_normal"),
+    ):
+        text = f'<string name="aovs" value="{own}"/>' if own else ""
+        _, parameters, _ = choose(integrator("manylights_direct", text), aovs=wish)
+        assert parameters["aovs"] == all_of_them
+        settings = {"aovs": own} if own else {}
+        assert integrators.joined(settings, {"aovs": wish}) == {"aovs": all_of_them}
+
+
+@pytest.mark.parametrize("name", ["aovs", "light_groups"])
+def test_a_parameter_that_an_argument_sets_too_is_refused(name, scene, capsys, tmp_path):
+    require_variant("scalar_rgb")
+    with pytest.raises(UsageError, match=rf'^{name}: integrator\["{name}"\] is the same, give one'):
+        package.render(scene, integrator={"type": "manylights_direct", name: "x"}, **{name: "uv"})
+    option = {"aovs": "--aov", "light_groups": "--light-groups"}[name]
+    command = ["render", str(scene), "-o", str(tmp_path / "o.exr"), "--set", f"{name}=x"]
+    assert cli.main([*command, option, "uv"]) == 2
+    assert f"manylights: {option}: --set {name} is the same, give one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("plugin", ["path", "manylights_volpath"])
+def test_paths_of_no_length_are_told(choose, plugin):
+    words = "integrator: with max_depth=0 nothing is seen, its image is black"
+    assert words in choose(integrator(plugin), "keep", max_depth=0)[2]
+    assert words not in choose(integrator(plugin), "keep", max_depth=1)[2]
+    text = '<integer name="max_depth" value="0"/>'
+    assert words in choose(integrator(plugin, text))[2]
+
+
 @pytest.mark.parametrize("plugin", ["manylights_direct", "manylights_volpath"])
 def test_listed_parameters_are_those_of_the_plugin(plugin):
     """The plugin accepts all that the help lists, and the defaults are those it states."""

@@ -236,7 +236,8 @@ def _run(options) -> None:
         settings["hide_emitters"] = True
     if options.denoise:
         denoise.check_installed()
-    settings |= Extras(options.aov, options.light_groups, options.denoise).parameters()
+    extras = Extras(options.aov, options.light_groups, options.denoise)
+    settings = integrators.joined(settings, extras.parameters())
     shared.start(options)
     if options.workers is None:
         if options.ship:

@@ -7,12 +7,15 @@ are found like any other.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
-from manylights.errors import UsageError, argument, typed
+from manylights.errors import UsageError, argument, is_integer, shown, typed
 from manylights.loading import light_groups
 from manylights.output import channels
 
@@ -182,6 +185,8 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
         raise UsageError(f"{_parameter(name)}: the scene has no integrator, name one{by_name()}")
     for node in leaves:
         _apply(node.props, settings)
+        if node.props.get("max_depth") == 0:
+            notes.append("integrator: with max_depth=0 nothing is seen, its image is black")
     return notes
 
 
@@ -345,7 +350,49 @@ def _apply(props, settings: dict[str, Any]) -> None:
         if name == light_groups.PARAMETER and plugin not in PARAMETERS:
             known = " and ".join(PARAMETERS)
             raise UsageError(f"{argument(name)}: {plugin} has none, {known} have{by_name()}")
-        props[name] = value
+        if plugin in PARAMETERS and name in PARAMETERS[plugin]:
+            _check_type(name, value, PARAMETERS[plugin][name])
+        props[name] = with_wish(props.get(name, ""), value)
+
+
+def _check_type(name: str, value: Any, parameter: Parameter) -> None:
+    """Raise ``UsageError`` for a value of a wrong type; the plugins check the others."""
+    kind = type(parameter.default)
+    fits = {
+        bool: isinstance(value, (bool, np.bool_)),
+        int: is_integer(value),
+        float: is_integer(value) or isinstance(value, Real),
+        str: isinstance(value, str),
+    }[kind]
+    allowed = parameter.allowed
+    word = isinstance(value, str) and value in ("inf", "keep") and value in allowed.split()
+    if not fits and not word:
+        article = {"integer": "an ", "float": "a "}.get(allowed.split()[0], "")
+        raise UsageError(f"{_parameter(name)} {shown(value)}: must be {article}{allowed}")
+
+
+def with_wish(text: str, value: Any) -> Any:
+    """Return a value to set; of a wish for channels what a text with others lacks is added."""
+    if not isinstance(value, Wish) or not text:
+        return value
+    known = [pair.partition(":")[0] for pair in re.split(r"[,\s]+", text)]
+    added = [pair for pair in value.split(",") if pair.partition(":")[0] not in known]
+    return ",".join([text, *added])
+
+
+def joined(settings: dict[str, Any], added: dict[str, Any]) -> dict[str, Any]:
+    """Return parameters with those that options of their own ask for.
+
+    Raises:
+        UsageError: one of them has another value already.
+    """
+    result = dict(settings)
+    for name, value in added.items():
+        if name in settings and not isinstance(value, Wish):
+            other = typed(f'integrator["{name}"]', f"--set {name}")
+            raise UsageError(f"{argument(name)}: {other} is the same, give one of them")
+        result[name] = with_wish(settings.get(name, ""), value)
+    return result
 
 
 def _listed(props) -> str:

@@ -123,7 +123,7 @@ def as_loaded(scene, integrator=None, added: dict | None = None) -> tuple[Loaded
     own = integrator if isinstance(integrator, mi.Integrator) else None
     settings = dict(integrator) if isinstance(integrator, dict) else {}
     name = settings.pop("type", None) if settings else ("keep" if own else integrator)
-    settings |= {} if own else added or {}
+    settings = integrators.joined(settings, {} if own else added or {})
     if isinstance(scene, dict):
         return load_description(scene, name, settings), own
     if isinstance(scene, (str, os.PathLike)):
