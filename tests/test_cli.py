@@ -19,7 +19,7 @@ import pytest
 from manylights import __version__, cli, loading, plugin_dir
 from manylights.cli.main import parser
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import integrators, ours
 from manylights.output import exr
 from manylights.progress import Estimate, format_seconds
 
@@ -326,7 +326,7 @@ def test_parameters_of_right_types_are_taken(choose):
 
 def test_channels_for_the_denoiser_are_added_to_those_of_the_scene(choose):
     """Those of another type under a wanted name stay."""
-    wish = integrators.Wish("albedo:albedo,normal:sh_normal")
+    wish = ours.Wish("albedo:albedo,normal:sh_normal")
     for own, all_of_them in (
         ("Z:depth", "Z:depth,albedo:albedo,normal:sh_normal"),
         ("Z:depth, normal:geo_normal", "Z:depth, normal:geo_normal,albedo:albedo"),
@@ -336,7 +336,7 @@ def test_channels_for_the_denoiser_are_added_to_those_of_the_scene(choose):
         _, parameters, _ = choose(integrator("manylights_direct", text), aovs=wish)
         assert parameters["aovs"] == all_of_them
         settings = {"aovs": own} if own else {}
-        assert integrators.joined(settings, {"aovs": wish}) == {"aovs": all_of_them}
+        assert ours.joined(settings, {"aovs": wish}) == {"aovs": all_of_them}
 
 
 @pytest.mark.parametrize("name", ["aovs", "light_groups"])
@@ -363,8 +363,8 @@ def test_paths_of_no_length_are_told(choose, plugin):
 def test_listed_parameters_are_those_of_the_plugin(plugin):
     """The plugin accepts all that the help lists, and the defaults are those it states."""
     mi.set_variant("scalar_rgb")
-    for name, parameter in integrators.PARAMETERS[plugin].items():
-        default = integrators.parse_value(str(parameter).rpartition("default ")[2].split(",")[0])
+    for name, parameter in ours.PARAMETERS[plugin].items():
+        default = ours.parse_value(str(parameter).rpartition("default ")[2].split(",")[0])
         default = "" if default == "none" else default
         assert default == parameter.default
         needed = {"method": "talk"} if name == "split_function" else {}
@@ -385,7 +385,7 @@ def test_parameters_of_the_tree_are_found(tmp_path, plugin):
 
 def test_help_lists_the_parameters_of_both_plugins():
     text = manylights("render", "--help").stdout
-    for plugin, parameters in integrators.PARAMETERS.items():
+    for plugin, parameters in ours.PARAMETERS.items():
         table = text.partition(f"parameters of {plugin}:")[2]
         assert all(f"  {name} " in table for name in parameters)
 

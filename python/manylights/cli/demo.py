@@ -7,7 +7,7 @@ import mitsuba as mi
 from manylights import lights, loading, scenes
 from manylights.cli import options as shared
 from manylights.cli.render import render_to
-from manylights.loading import integrators, samplers
+from manylights.loading import integrators, ours, samplers
 from manylights.output import images
 from manylights.progress import say
 from manylights.scenes._build import MOST_LIGHTS
@@ -51,7 +51,7 @@ def _run(options) -> None:
         width=options.width,
         height=options.height,
         spp=spp,
-        integrator={"type": integrators.DIRECT, "block_size": integrators.BLOCK_SIZE},
+        integrator={"type": ours.DIRECT, "block_size": integrators.BLOCK_SIZE},
     )
     description["sensor"]["sampler"]["type"] = samplers.SOBOL
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])

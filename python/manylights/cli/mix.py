@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from manylights.cli import options as shared
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.output import images
 from manylights.progress import say
 from manylights.rendering.mix import mix
@@ -52,7 +52,7 @@ def add(commands, common) -> None:
 def _run(options) -> None:
     mi.set_variant("scalar_rgb")
     images.check_output(options.output)
-    texts = integrators.parse_assignments(options.weights, "group")
+    texts = ours.parse_assignments(options.weights, "group")
     if len(texts) < len(options.weights):
         raise UsageError("mix: a group is given twice")
     weights = {name: _weight(name, text) for name, text in texts.items()}

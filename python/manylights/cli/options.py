@@ -8,7 +8,7 @@ import math
 import shtab
 
 from manylights import loading
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.loading.parsing import MOST_SUBDIVISION
 from manylights.progress import say
 from manylights.rendering.parts import MOST_PARTS, Part
@@ -92,7 +92,7 @@ def defines(options) -> dict[str, str]:
     Raises:
         UsageError: one is not NAME=VALUE.
     """
-    return integrators.parse_assignments(options.define, "-D")
+    return ours.parse_assignments(options.define, "-D")
 
 
 def usd_options(options) -> loading.UsdOptions:

@@ -10,7 +10,7 @@ from pathlib import Path
 from manylights import loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.output import channels, denoise, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
 from manylights.rendering import Progress, RenderResult, live, render
@@ -217,7 +217,7 @@ def _add_targets(parser) -> None:
 def _parameter_help() -> str:
     """Return the parameters of our integrators as a table for the help."""
     lines = []
-    for plugin, parameters in integrators.PARAMETERS.items():
+    for plugin, parameters in ours.PARAMETERS.items():
         lines += ["", f"parameters of {plugin}:"]
         width = max(map(len, parameters))
         for name, parameter in parameters.items():
@@ -230,14 +230,14 @@ def _parameter_help() -> str:
 def _run(options) -> None:
     target = images.check_output(options.output)
     defines = shared.defines(options)
-    settings = integrators.parse_assignments(options.set, "--set")
-    settings = {name: integrators.parse_value(text) for name, text in settings.items()}
+    settings = ours.parse_assignments(options.set, "--set")
+    settings = {name: ours.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
         settings["hide_emitters"] = True
     if options.denoise:
         denoise.check_installed()
     extras = Extras(options.aov, options.light_groups, options.denoise)
-    settings = integrators.joined(settings, extras.parameters())
+    settings = ours.joined(settings, extras.parameters())
     shared.start(options)
     if options.workers is None:
         if options.ship:

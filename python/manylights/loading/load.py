@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 
 from manylights.errors import UsageError, check, shown
-from manylights.loading import integrators, light_groups, merging, samplers
+from manylights.loading import integrators, light_groups, merging, ours, samplers
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
@@ -110,9 +110,7 @@ def as_loaded(scene, integrator=None, added: dict | None = None) -> tuple[Loaded
         named = isinstance(integrator.get("type"), str)
         check("integrator", integrator, named, 'a dictionary with the name of a plugin as "type"')
     made = isinstance(scene, (mi.Scene, LoadedScene))
-    strict = [
-        name for name, value in (added or {}).items() if not isinstance(value, integrators.Wish)
-    ]
+    strict = [name for name, value in (added or {}).items() if not isinstance(value, ours.Wish)]
     if strict and (made or isinstance(integrator, mi.Integrator)):
         what = "scene" if made else "integrator"
         raise UsageError(f"{strict[0]}: the {what} is made already, set the parameter before")
@@ -123,7 +121,7 @@ def as_loaded(scene, integrator=None, added: dict | None = None) -> tuple[Loaded
     own = integrator if isinstance(integrator, mi.Integrator) else None
     settings = dict(integrator) if isinstance(integrator, dict) else {}
     name = settings.pop("type", None) if settings else ("keep" if own else integrator)
-    settings = integrators.joined(settings, {} if own else added or {})
+    settings = ours.joined(settings, {} if own else added or {})
     if isinstance(scene, dict):
         return load_description(scene, name, settings), own
     if isinstance(scene, (str, os.PathLike)):

@@ -22,7 +22,8 @@ import numpy as np
 
 from manylights.errors import check
 from manylights.loading import light_groups, parsing
-from manylights.loading.integrators import PARAMETERS, leaf_integrators
+from manylights.loading.integrators import leaf_integrators
+from manylights.loading.ours import PARAMETERS
 from manylights.output import channels
 from manylights.threads import require_variant
 

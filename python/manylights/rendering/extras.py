@@ -9,7 +9,7 @@ from typing import Any
 
 from manylights.errors import argument, check, typed
 from manylights.loading import light_groups
-from manylights.loading.integrators import Wish
+from manylights.loading.ours import Wish
 from manylights.output import channels, images
 from manylights.output import denoise as denoising
 from manylights.rendering import live

@@ -8,8 +8,9 @@ import numpy as np
 
 from manylights.errors import check, integer, one_line, typed
 from manylights.files import path_of
-from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
+from manylights.loading.integrators import REPLACEMENTS
 from manylights.loading.light_groups import PARAMETER, as_text
+from manylights.loading.ours import PARAMETERS, VOLPATH
 from manylights.loading.parsing import MOST_SUBDIVISION, UsdOptions
 from manylights.threads import require_variant
 from manylights.usd import cameras, skinning
