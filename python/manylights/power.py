@@ -38,6 +38,9 @@ def power_weights(scene) -> np.ndarray:
     The weights are the powers, averaged over channels, divided by their mean, and at least
     ``FLOOR``. Emitters of unknown power, those that cannot send out rays, get the weight 1.
     Without any power all weights are 1.
+
+    Raises:
+        UsageError: (a ``ValueError``) it is no ``mi.Scene`` of the current variant.
     """
     _check_scene(scene)
     powers = _emitter_powers(scene)

@@ -71,7 +71,8 @@ def merge(
     """Add parts of one render, in any order and grouping, or average renders of several seeds.
 
     All parts together give the bits of the render that was not parted. Of finished images the mean
-    is taken, in double precision, weighted by samples.
+    is taken, in double precision, weighted by samples. The file says what all of them say, of the
+    camera, too.
 
     Args:
         paths: files that ``render(..., part=...)``, a checkpoint or an earlier merging wrote, or
@@ -85,6 +86,7 @@ def merge(
     Raises:
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
             that comes twice, or one that is missing and ``partial`` is not set.
+        RuntimeError: no variant of Mitsuba is set.
     """
     require_variant()
     target = None if output is None else images.check_output(str(output))

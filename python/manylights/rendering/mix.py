@@ -50,7 +50,8 @@ def mix(
 
     All in single precision: each layer is a product, the image the sum of the layers in the order
     of their channels' names. Groups without a weight stay as they are; of a mix another mix can be
-    made.
+    made. Layers of surfaces and attributes of the file are kept; what is that of the render alone
+    (``variance``, ``emission``, ``denoised``) is left out.
 
     Args:
         path: an image that ``render(..., light_groups=...)`` or ``manylights render`` wrote.
@@ -60,6 +61,7 @@ def mix(
 
     Raises:
         UsageError: (a ``ValueError``) no render of ours, no such group, a wrong weight.
+        RuntimeError: there is an output, and no variant of Mitsuba is set.
     """
     target = None if output is None else images.check_output(str(output))
     if target is not None:
