@@ -222,7 +222,8 @@ def test_other_integrators_stay(choose, old):
 def test_scene_without_integrator_gets_paths_with_the_tree(choose):
     name, parameters, notes = choose("")
     assert (name, parameters) == ("manylights_volpath", {})
-    assert "names none, using manylights_volpath" in notes[0] and "keep" in notes[0]
+    words = 'using manylights_volpath (integrator="NAME" takes another)'
+    assert notes[0] == f"integrator: the scene names none, {words}"
 
 
 def test_scene_without_integrator_can_be_kept(choose):

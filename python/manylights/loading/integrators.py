@@ -142,7 +142,8 @@ def _without_integrator(state, wanted: str | None) -> tuple[list, list[str]]:
     state.nodes.append(node)
     index = len(state.nodes) - 1
     state.root.props["_arg_integrator"] = mi.Properties.ResolvedReference(index)
-    note = f"integrator: the scene names none, using {chosen}{_undo(wanted)}"
+    other = "" if wanted else by_name("NAME", " takes another")
+    note = f"integrator: the scene names none, using {chosen}{other}"
     return [state.nodes[index]], [note, *_about_media(state, "path", chosen)]
 
 
