@@ -64,7 +64,18 @@ def load(
         settings: parameters to set on the integrator. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
         sampler: ``None`` (``independent`` becomes ours), ``"keep"`` or a plugin's name.
+
+    Raises:
+        UsageError: (a ``ValueError``) no such file, or an argument that is something else.
+        RuntimeError: Mitsuba cannot read or make the scene.
     """
+    for name, value in (("integrator", integrator), ("sampler", sampler)):
+        check(name, value, value is None or isinstance(value, str), "the name of a plugin")
+    for name, value, kind, what in (
+        ("settings", settings, dict, "a dictionary"),
+        ("usd_options", usd_options, UsdOptions, "UsdOptions"),
+    ):
+        check(name, value, value is None or isinstance(value, kind), what)
     with search_beside(path), threads_for_files():
         groups = light_groups.as_text((settings or {}).get(light_groups.PARAMETER, ""))
         parsed = parse(path, defines, usd_options, groups)

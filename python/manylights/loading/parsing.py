@@ -13,7 +13,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError, argument, one_line, shown
+from manylights.errors import UsageError, argument, check, one_line, shown
+from manylights.files import path_of
 
 #: Endings of USD stages: whichever format, in text, binary, and packed.
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -82,6 +83,8 @@ def parse(
             ``defines`` for a stage or options of stages for XML.
         RuntimeError: Mitsuba cannot read it.
     """
+    path_of("path", path)
+    check("defines", defines, defines is None or isinstance(defines, dict), "a dictionary")
     if not Path(path).is_file():
         folder = path and Path(path).is_dir()
         what = "is a folder, not a scene" if folder else "no such file"
@@ -214,6 +217,7 @@ class search_beside:
     """
 
     def __init__(self, path: str) -> None:
+        path_of("path", path)
         folders = (Path(os.path.abspath(path)).parent, Path(path).resolve().parent)
         self.folders = [str(folder) for folder in dict.fromkeys(folders)]
 
