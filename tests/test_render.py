@@ -391,6 +391,17 @@ def test_values_in_messages_are_short(scalar):
     assert len(str(raised.value)) < 200 and "\n" not in str(raised.value)
 
 
+def test_paths_in_messages_are_whole(scalar, tmp_path, capsys):
+    path = tmp_path / ("long" * 30) / "a.exr"
+    for learnt in (path, str(path)):
+        with pytest.raises(UsageError) as raised:
+            manylights.render(loaded(), learnt=learnt)
+        assert str(raised.value) == f"learnt '{path}': must be given with part"
+    command = ["render", "", "-o", str(tmp_path / "o.exr"), "--variant", "scalar_rgb"]
+    assert cli.main(command) == 2
+    assert "manylights: '': no such file" in capsys.readouterr().err
+
+
 def test_scenes_without_an_integrator_need_one(scalar):
     scene = {"type": "scene", "sensor": {"type": "perspective"}, "lamp": {"type": "constant"}}
     scene["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4}

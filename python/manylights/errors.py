@@ -60,9 +60,12 @@ def argument(name: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a value as the user typed it, on one line that is not too long."""
-    plain = _in_shell or isinstance(value, os.PathLike)
-    text = " ".join((str(value) if plain else repr(value)).split())
+    """Return a value as the user typed it; objects on one line that is not too long."""
+    if _in_shell:
+        return str(value) or "''"
+    if isinstance(value, (os.PathLike, str)):
+        return repr(str(value))
+    text = " ".join(repr(value).split())
     return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 
 
