@@ -771,6 +771,7 @@ def test_help_begins_with_examples_that_are_understood(command):
         ("render", "manylights render: the following arguments are required: SCENE, -o/--output ("),
         ("render --spp 0", "manylights render: --spp 0: must be an integer of at least 1 ("),
         ("render --spp many", "manylights render: --spp many: must be an integer of at least 1 ("),
+        ("render --threads 5000", "render: --threads 5000: must be an integer from 1 to 4096 ("),
         ("render --sensor -1", "render: --sensor -1: must be an integer of at least 0 ("),
         ("render --seed 1.5", "render: --seed 1.5: must be an integer from 0 to 4294967295 ("),
         ("render --seed 4294967296", "render: --seed 4294967296: must be an integer from 0 to"),

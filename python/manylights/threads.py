@@ -8,6 +8,9 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 
+#: More are no use, and Linux does not start them.
+MOST_THREADS = 4096
+
 
 def require_variant() -> None:
     """Raise RuntimeError if no variant is set, where Mitsuba itself would not say so."""

@@ -12,6 +12,7 @@ from manylights.loading import ours
 from manylights.loading.parsing import MOST_SUBDIVISION
 from manylights.progress import say
 from manylights.rendering.parts import MOST_PARTS, Part
+from manylights.threads import MOST_THREADS
 
 VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scalar_rgb)"
 
@@ -72,7 +73,7 @@ def add_machine(parser) -> None:
     group = parser.add_argument_group("random numbers and machine")
     group.add_argument("--seed", type=seed, default=0, help="0 to 4294967295 (default: 0)")
     group.add_argument("--variant", help=VARIANT_HELP)
-    group.add_argument("--threads", type=positive, help="CPU threads of the render (default: all)")
+    group.add_argument("--threads", type=threads, help="CPU threads of the render (default: all)")
 
 
 def add_exposure(parser) -> None:
@@ -129,6 +130,11 @@ def positive(text: str) -> int:
 def seed(text: str) -> int:
     """A seed of 32 bits."""
     return integer(text, 0, 2**32 - 1, "an integer from 0 to 4294967295")
+
+
+def threads(text: str) -> int:
+    """A number of threads."""
+    return integer(text, 1, MOST_THREADS, f"an integer from 1 to {MOST_THREADS}")
 
 
 def index(text: str) -> int:

@@ -25,10 +25,7 @@ from manylights.rendering.extras import Extras
 from manylights.rendering.job import Job
 from manylights.rendering.parts import Part
 from manylights.rendering.state import State
-from manylights.threads import thread_count
-
-#: More are no use, and Linux does not start them.
-MOST_THREADS = 4096
+from manylights.threads import MOST_THREADS, thread_count
 
 
 @dataclass
