@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.loading.load import load_description
 from manylights.output import channels, exr
 
@@ -428,4 +428,4 @@ def test_films_with_bands_of_their_own_refuse_channels(settings):
 
 def test_the_help_lists_what_can_be_asked_for():
     known = {kind for _, kind in channels.AOVS.values()}
-    assert all(kind in integrators.AOVS.allowed for kind in known)
+    assert all(kind in ours.AOVS.allowed for kind in known)

@@ -12,13 +12,14 @@ import sys
 import time
 from pathlib import Path
 
+import manylights as package
 import mitsuba as mi
 import numpy as np
 import pytest
 from manylights import __version__, cli, loading, plugin_dir
 from manylights.cli.main import parser
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import integrators, ours
 from manylights.output import exr
 from manylights.progress import Estimate, format_seconds
 
@@ -221,14 +222,14 @@ def test_other_integrators_stay(choose, old):
 def test_scene_without_integrator_gets_paths_with_the_tree(choose):
     name, parameters, notes = choose("")
     assert (name, parameters) == ("manylights_volpath", {})
-    assert "names none, using manylights_volpath" in notes[0] and "keep" in notes[0]
+    words = 'using manylights_volpath (integrator="NAME" takes another)'
+    assert notes[0] == f"integrator: the scene names none, {words}"
 
 
 def test_scene_without_integrator_can_be_kept(choose):
     name, _, notes = choose("", "keep")
-    assert name is None
-    assert "Mitsuba uses path" in notes[0]
-    with pytest.raises(UsageError, match="choose one with --integrator"):
+    assert name is None and notes == []
+    with pytest.raises(UsageError, match=r'name one \(integrator="NAME"\)'):
         choose("", "keep", max_depth=2)
 
 
@@ -290,16 +291,81 @@ def test_unknown_parameters_are_refused_with_those_of_the_integrator(choose, plu
     for text in (integrator(plugin), integrator("path")):
         with pytest.raises(UsageError) as raised:
             choose(text, plugin, **{wrong: 1})
-        assert f"--set {wrong}: {plugin} has no such parameter" in str(raised.value)
+        assert f'integrator["{wrong}"]: {plugin} has no such parameter' in str(raised.value)
         assert listed in str(raised.value) and f"{wrong} (" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("reservoirs", "many", "an integer from 1 to 64"),
+        ("reservoirs", 2.0, "an integer from 1 to 64"),
+        ("reservoirs", True, "an integer from 1 to 64"),
+        ("reservoirs", None, "an integer from 1 to 64"),
+        ("splitting_rate", "many", "a float >= 0 or inf"),
+        ("counts", 1, "true or false"),
+        ("counts", "true", "true or false"),
+        ("learn_visibility", "no", "true, false or keep"),
+        ("method", 3, "resampled_tree, talk, adaptive_splitting, tree or exhaustive"),
+    ],
+)
+def test_parameters_of_wrong_types_are_named(choose, name, value, allowed):
+    with pytest.raises(UsageError) as raised:
+        choose(integrator("manylights_direct"), **{name: value})
+    assert str(raised.value) == f'integrator["{name}"] {value!r}: must be {allowed}'
+
+
+def test_parameters_of_right_types_are_taken(choose):
+    right = {"reservoirs": np.int64(8), "splitting_rate": 2, "counts": True, "aovs": "Z:depth"}
+    right |= {"learn_visibility": "keep", "method": "tree", "hide_emitters": np.bool_(True)}
+    _, parameters, _ = choose(integrator("manylights_direct"), **right)
+    assert parameters == right
+    for rate in ("inf", float("inf"), np.float32(0.5), 0):
+        _, parameters, _ = choose(integrator("manylights_direct"), splitting_rate=rate)
+        assert parameters == {"splitting_rate": rate}
+
+
+def test_channels_for_the_denoiser_are_added_to_those_of_the_scene(choose):
+    """Those of another type under a wanted name stay."""
+    wish = ours.Wish("albedo:albedo,normal:sh_normal")
+    for own, all_of_them in (
+        ("Z:depth", "Z:depth,albedo:albedo,normal:sh_normal"),
+        ("Z:depth, normal:geo_normal", "Z:depth, normal:geo_normal,albedo:albedo"),
+        (None, "albedo:albedo,normal:sh_normal"),
+    ):
+        text = f'<string name="aovs" value="{own}"/>' if own else ""
+        _, parameters, _ = choose(integrator("manylights_direct", text), aovs=wish)
+        assert parameters["aovs"] == all_of_them
+        settings = {"aovs": own} if own else {}
+        assert ours.joined(settings, {"aovs": wish}) == {"aovs": all_of_them}
+
+
+@pytest.mark.parametrize("name", ["aovs", "light_groups"])
+def test_a_parameter_that_an_argument_sets_too_is_refused(name, scene, capsys, tmp_path):
+    require_variant("scalar_rgb")
+    with pytest.raises(UsageError, match=rf'^{name}: integrator\["{name}"\] is the same, give one'):
+        package.render(scene, integrator={"type": "manylights_direct", name: "x"}, **{name: "uv"})
+    option = {"aovs": "--aov", "light_groups": "--light-groups"}[name]
+    command = ["render", str(scene), "-o", str(tmp_path / "o.exr"), "--set", f"{name}=x"]
+    assert cli.main([*command, option, "uv"]) == 2
+    assert f"manylights: {option}: --set {name} is the same, give one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("plugin", ["path", "manylights_volpath"])
+def test_paths_of_no_length_are_told(choose, plugin):
+    words = "integrator: with max_depth=0 nothing is seen, its image is black"
+    assert words in choose(integrator(plugin), "keep", max_depth=0)[2]
+    assert words not in choose(integrator(plugin), "keep", max_depth=1)[2]
+    text = '<integer name="max_depth" value="0"/>'
+    assert words in choose(integrator(plugin, text))[2]
 
 
 @pytest.mark.parametrize("plugin", ["manylights_direct", "manylights_volpath"])
 def test_listed_parameters_are_those_of_the_plugin(plugin):
     """The plugin accepts all that the help lists, and the defaults are those it states."""
     mi.set_variant("scalar_rgb")
-    for name, parameter in integrators.PARAMETERS[plugin].items():
-        default = integrators.parse_value(str(parameter).rpartition("default ")[2].split(",")[0])
+    for name, parameter in ours.PARAMETERS[plugin].items():
+        default = ours.parse_value(str(parameter).rpartition("default ")[2].split(",")[0])
         default = "" if default == "none" else default
         assert default == parameter.default
         needed = {"method": "talk"} if name == "split_function" else {}
@@ -320,7 +386,7 @@ def test_parameters_of_the_tree_are_found(tmp_path, plugin):
 
 def test_help_lists_the_parameters_of_both_plugins():
     text = manylights("render", "--help").stdout
-    for plugin, parameters in integrators.PARAMETERS.items():
+    for plugin, parameters in ours.PARAMETERS.items():
         table = text.partition(f"parameters of {plugin}:")[2]
         assert all(f"  {name} " in table for name in parameters)
 
@@ -410,8 +476,81 @@ def test_parameter_out_of_range(scene, tmp_path):
     assert_fails(process, "splitting_rate", "-1")
 
 
+SPHERE = {"type": "scene", "sensor": {"type": "perspective"}, "ball": {"type": "sphere"}}
+DEPTH = {**SPHERE, "integrator": {"type": "depth"}}
+
+
+@pytest.mark.parametrize(
+    ("python", "said", "shell", "typed"),
+    [
+        ({"output": "o.png"}, "output o.png: the image is", "-o o.png", "-o o.png: the image is"),
+        (
+            {"learnt": "a.exr"},
+            "learnt 'a.exr': must be given with part",
+            "--learnt a.exr",
+            "--learnt a.exr: must be given with --part",
+        ),
+        (
+            {"part": (1, 2), "exposure": 1.0},
+            "exposure 1.0: must be left out with part, and given to manylights.merge",
+            "--part 1/2 --exposure 1",
+            "--exposure 1.0: must be left out with --part, and given to manylights merge",
+        ),
+        (
+            {"integrator": {"type": "manylights_direct", "reservoir": 2}},
+            'integrator["reservoir"]: manylights_direct has no such',
+            "--set reservoir=2",
+            "--set reservoir: manylights_direct has no such",
+        ),
+        ({"aovs": "color"}, "aovs 'color': must be", "--aov color", "--aov 'color': must be"),
+        (
+            {"scene": DEPTH, "aovs": "uv"},
+            "aovs: depth shows no surfaces, manylights_direct or manylights_volpath do (int",
+            "--integrator depth --aov uv",
+            "--aov: depth shows no surfaces, manylights_direct or manylights_volpath do (--int",
+        ),
+        (
+            {"scene": DEPTH, "light_groups": "a=b"},
+            "light_groups: depth has none, ",
+            "--integrator depth --light-groups a=b",
+            "--light-groups: depth has none, ",
+        ),
+        ({"tev": "a:b"}, "tev a:b: must be HOST:PORT", "--tev a:b", "--tev a:b: must be HOST:PORT"),
+    ],
+)
+def test_messages_name_what_was_typed_in_python_or_in_the_shell(
+    scene, tmp_path, monkeypatch, capsys, python, said, shell, typed
+):
+    monkeypatch.chdir(tmp_path)
+    require_variant("scalar_rgb")
+    with pytest.raises(UsageError) as raised:
+        package.render(**{"scene": SPHERE, "spp": 1, **python})
+    assert str(raised.value).startswith(said)
+    command = ["render", str(scene), "--spp", "1", "--variant", "scalar_rgb", *shlex.split(shell)]
+    assert cli.main(command + ([] if "-o" in command else ["-o", "o.exr"])) == 2
+    assert f"manylights: {typed}" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.exr"))
+
+
+def test_notes_say_how_to_undo_a_choice_in_python_or_in_the_shell(scene, tmp_path, capsys):
+    require_variant("scalar_rgb")
+    notes = package.render(scene, spp=1).notes
+    assert any(note.endswith('(integrator="keep" undoes it)') for note in notes)
+    assert any(note.endswith("(an mi.Scene keeps its own)") for note in notes)
+    command = ["render", str(scene), "-o", str(tmp_path / "o.exr"), "--spp", "1"]
+    assert cli.main([*command, "--variant", "scalar_rgb"]) == 0
+    said = capsys.readouterr().err
+    assert "(--integrator keep undoes it)" in said and "(--sampler keep undoes it)" in said
+
+
+def test_convert_names_its_output_as_it_was_typed(capsys):
+    assert cli.main(["convert", "stage.usda", "out.txt"]) == 2
+    assert capsys.readouterr().err.startswith("manylights: out.txt: Mitsuba's scenes are XML files")
+
+
 def test_unknown_scene_parameter(scene, tmp_path):
-    assert_fails(manylights("render", scene, "-o", tmp_path / "o.exr", "-D", "sky=1"), "sky")
+    process = manylights("render", scene, "-o", tmp_path / "o.exr", "-D", "sky=1")
+    assert_fails(process, f"manylights: -D sky: {scene} has no <default> of this name")
 
 
 def test_unknown_variant(scene, tmp_path):
@@ -624,9 +763,39 @@ def test_help_begins_with_examples_that_are_understood(command):
         parser().parse_args(shlex.split(re.split(r"\s{3,}", line.strip())[0])[1:])
 
 
-def test_no_command():
-    process = manylights()
-    assert process.returncode == 2 and "COMMAND" in process.stderr
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("", "manylights: which COMMAND? (see manylights --help)"),
+        ("rendr", "manylights: COMMAND invalid choice: 'rendr'"),
+        ("render", "manylights render: the following arguments are required: SCENE, -o/--output ("),
+        ("render --spp 0", "manylights render: --spp 0: must be an integer of at least 1 ("),
+        ("render --spp many", "manylights render: --spp many: must be an integer of at least 1 ("),
+        ("render --threads 5000", "render: --threads 5000: must be an integer from 1 to 4096 ("),
+        ("render --sensor -1", "render: --sensor -1: must be an integer of at least 0 ("),
+        ("render --seed 1.5", "render: --seed 1.5: must be an integer from 0 to 4294967295 ("),
+        ("render --seed 4294967296", "render: --seed 4294967296: must be an integer from 0 to"),
+        ("render --exposure high", "render: --exposure high: must be a number from -64 to 64 ("),
+        ("render s.xml -o o.exr --fast", "render: unknown: --fast (see manylights render --help)"),
+        ("tree a.xml b.xml", "manylights tree: unknown: b.xml (see manylights tree --help)"),
+        ("demo --lights 0", "demo: --lights 0: must be an integer from 1 to 1,000,000 ("),
+        ("demo --lights 1000001", "--lights 1000001: must be an integer from 1 to 1,000,000 ("),
+        ("bench --seeds few", "manylights bench: --seeds few: must be at least 1, the number of"),
+    ],
+)
+def test_a_wrong_command_line_gets_one_line(capsys, command, message):
+    with pytest.raises(SystemExit) as raised:
+        cli.main(command.split())
+    assert raised.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line and line.endswith("--help)")
+
+
+def test_demo_does_not_add_an_ending_twice(tmp_path, capsys):
+    small = ["--lights", "1", "--spp", "1", "--width", "4", "--height", "4"]
+    out = str(tmp_path / "city.exr")
+    assert cli.main(["demo", "-o", out, *small, "--variant", "scalar_rgb"]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["city.exr", "city.png"]
 
 
 def test_estimate_advances_between_reports_but_not_past_the_next_one():

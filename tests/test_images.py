@@ -90,7 +90,8 @@ def test_files_that_are_no_images_are_named(content, planes, tmp_path):
         exr.write(path, planes, {})
         content = path.read_bytes()[: path.stat().st_size // 2]
     path.write_bytes(content)
-    with pytest.raises(UsageError, match=r"a\.exr: not a whole OpenEXR image"):
+    reason = "its end is missing|it has no part" if b"channels" in content else "it does not begin"
+    with pytest.raises(UsageError, match=rf"a\.exr: not a whole OpenEXR image \(({reason})"):
         exr.read(path)
 
 

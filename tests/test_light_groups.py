@@ -1,6 +1,7 @@
 """Light groups: layers that sum to the image, and are what their lamps alone would give; mixes."""
 
 import itertools
+import re
 from types import SimpleNamespace
 
 import manylights
@@ -250,6 +251,34 @@ def test_a_group_without_lights_is_an_error(scalar, groups):
         )
 
 
+NAMELESS = """<scene version="3.0.0">
+    <sensor type="perspective"><film type="hdrfilm">
+        <integer name="width" value="4"/><integer name="height" value="4"/>
+        <string name="pixel_format" value="rgb"/>
+    </film></sensor>
+    <shape type="sphere"><point name="center" value="3, 0, 0"/><emitter type="area"/></shape>
+    <emitter type="constant"/>
+</scene>
+"""
+
+
+def test_lights_without_ids_are_told(scalar, tmp_path, capsys):
+    path = tmp_path / "scene.xml"
+    path.write_text(NAMELESS)
+    words = "light_groups key=lamp_*: no light of the scene has an id, nor has its shape, give"
+    with pytest.raises(UsageError, match=re.escape(words)):
+        manylights.render(path, spp=1, light_groups="key=lamp_*")
+    command = ["render", str(path), "-o", str(tmp_path / "o.exr"), "--variant", "scalar_rgb"]
+    assert cli.main([*command, "--light-groups", "key=lamp_*"]) == 2
+    assert "manylights: --light-groups key=lamp_*: no light of the" in capsys.readouterr().err
+    # All of them are a group all the same
+    assert manylights.render(path, spp=1, light_groups="all=*").image.any()
+    path.write_text(NAMELESS.replace('"constant"', '"constant" id="sky"'))
+    assert manylights.render(path, spp=1, light_groups="key=sky").image.any()
+    assert cli.main([*command, "--light-groups", "key=moon"]) == 2
+    assert 'manylights: in the parameter "light_groups", "key=moon"' in capsys.readouterr().err
+
+
 def test_sixteen_groups_are_allowed_and_no_lights_at_all_need_none(scalar):
     groups = ",".join(f"g{index}=lamp_{index}" for index in range(16))
     image, names = rendered(
@@ -404,7 +433,9 @@ def test_variants_without_colours_say_which_have_them(variant):
             integrator='light_groups = "key=lamp_*"', sensor=SimpleNamespace(film=lambda: film)
         )
         colored = variant.partition("_mono")[0] + "_rgb"
-        with pytest.raises(UsageError, match=f"no colours in {variant}, .*--variant {colored} has"):
+        with pytest.raises(
+            UsageError, match=f"no colours in {variant}, .*the variant {colored} has"
+        ):
             job._check_groups(driver)
     finally:
         mi.set_variant(before or "scalar_rgb")
@@ -473,6 +504,25 @@ def test_a_mix_is_exact(image, tmp_path):
         manylights.merge([image, target])
 
 
+def test_a_mix_keeps_what_it_does_not_change(scalar, tmp_path):
+    """Layers of surfaces, samples, the camera; not what lamps in sight emit."""
+    target, kept = tmp_path / "out.exr", "albedo,normal,depth"
+    manylights.render(
+        stage() | all_lights(), spp=2, output=target, light_groups=GROUPS, aovs=f"{kept},emission"
+    )
+    mixed = manylights.mix(target, {"key": 0}, tmp_path / "mixed.exr")
+    assert mixed.notes == ["left out, since it is that of the render: emission"]
+    before, told = exr.read(target)
+    after, said = exr.read(tmp_path / "mixed.exr")
+    assert before.keys() - after.keys() == {f"emission.{color}" for color in "RGB"}
+    assert not after["RGBA_key.R"].any() and (after["R"] != before["R"]).any()
+    for name in after.keys() - {"R", "G", "B", "RGBA_key.R", "RGBA_key.G", "RGBA_key.B"}:
+        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
+    assert said.keys() - told.keys() == {"manylights.mix"} and not told.keys() - said.keys()
+    for name in told:
+        np.testing.assert_array_equal(told[name], said[name], err_msg=name)
+
+
 def test_weights_of_one_leave_every_bit(image):
     planes, _ = exr.read(image)
     mixed = manylights.mix(image, {"key": 1.0})
@@ -504,7 +554,7 @@ def test_a_mix_is_the_render_with_other_lamps(scalar, tmp_path):
         (("key=-1",), "one or three finite numbers"),
         (("key=inf",), "one or three finite numbers"),
         (("key=1e39",), "one or three finite numbers"),
-        (("key",), "mix key: write it as"),
+        (("key",), "group key: write it as NAME=VALUE"),
         (("key=1", "key=2"), "given twice"),
     ],
 )
@@ -512,6 +562,20 @@ def test_wrong_weights_are_refused(image, tmp_path, capsys, words, text):
     assert mix(image, *words, "-o", tmp_path / "mixed.exr") == 2
     assert text in capsys.readouterr().err
     assert not (tmp_path / "mixed.exr").exists()
+
+
+def test_weights_of_wrong_types_are_refused(image):
+    for weights in (None, "key=2", [("key", 2)]):
+        with pytest.raises(UsageError, match="must be a dictionary of factors by group"):
+            manylights.mix(image, weights)
+    for weight in ("2", None, ["a", "b", "c"], [1, 2], np.ones(2), np.ones((3, 3)), {1: 2}):
+        with pytest.raises(UsageError, match=r"^key=.*must be one or three finite numbers"):
+            manylights.mix(image, {"key": weight})
+    with pytest.raises(UsageError, match="path 3: must be a path"):
+        manylights.mix(3, {"key": 1})
+    listed = manylights.mix(image, {"key": [1, 2, 3]}).image
+    for weight in (np.array([1, 2, 3]), np.array([1, 2, 3], np.float32)):
+        np.testing.assert_array_equal(manylights.mix(image, {"key": weight}).image, listed)
 
 
 def test_other_files_are_refused(scalar, tmp_path, capsys):

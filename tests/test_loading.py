@@ -89,8 +89,35 @@ def test_the_ending_chooses_the_reader(usd, scalar, tmp_path, ending):
 
 
 def test_defaults_of_a_stage_are_refused(usd, scalar):
-    with pytest.raises(UsageError, match=r"-D spp: .*stage\.usda is USD, only XML has <default>"):
+    with pytest.raises(
+        UsageError, match=r"defines spp: .*stage\.usda is USD, only XML has <default>"
+    ):
         loading.load(str(usd.path), {"spp": "4"})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"path": 3}, "path 3: must be a path"),
+        ({"defines": ["resx=8"]}, r"defines \['resx=8'\]: must be a dictionary"),
+        ({"defines": {"sky": "1"}}, r"defines sky: .*points\.xml has no <default> of this name"),
+        ({"integrator": {"type": "path"}}, "integrator {'type': 'path'}: must be the name of a pl"),
+        ({"sampler": 3}, "sampler 3: must be the name of a plugin"),
+        ({"settings": "max_depth=3"}, "settings 'max_depth=3': must be a dictionary"),
+        ({"usd_options": 3}, "usd_options 3: must be UsdOptions"),
+    ],
+)
+def test_arguments_of_wrong_types_are_named(scalar, arguments, words):
+    path = Path(__file__).parents[1] / "scenes" / "points.xml"
+    with pytest.raises(UsageError, match=words):
+        loading.load(**{"path": path, **arguments})
+
+
+def test_paths_may_be_objects(scalar):
+    path = Path(__file__).parents[1] / "scenes" / "points.xml"
+    assert describe(path) | {"build_ms": 0} == describe(str(path)) | {"build_ms": 0}
+    with pytest.raises(UsageError, match="path 3: must be a path"):
+        describe(3)
 
 
 def test_missing_usd_core_is_named(monkeypatch, capsys, tmp_path):

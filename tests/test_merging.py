@@ -203,6 +203,14 @@ def test_lamps_to_keep_and_lamps_that_others_refer_to_stay(scalar):
     mi.load_dict(manylights.merge_emitters(scene))
 
 
+def test_what_is_no_description_is_named(scalar):
+    for wrong in (None, "scene.xml", mi.load_dict({"type": "scene"})):
+        with pytest.raises(ValueError, match=r"must be a dictionary for mi\.load_dict"):
+            manylights.merge_emitters(wrong)
+    with pytest.raises(ValueError, match="keep 'lamp': must be a list of ids"):
+        manylights.merge_emitters({"type": "scene"}, keep="lamp")
+
+
 def test_a_file_read_with_face_normals_is_not_joined_with_smooth_ones(scalar, tmp_path):
     triangles, normals = light_scenes.octahedron(np.array([0, 0, 2]), 0.3)
     path = str(tmp_path / "ball.ply")

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from manylights.loading import integrators
+from manylights.loading import ours
 
 PLUGINS = ("manylights_direct", "manylights_volpath")
 SOURCES = Path(__file__).parents[1] / "plugins"
@@ -118,15 +118,15 @@ def test_a_wrong_word_in_the_documentation_is_found(tables):
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_help_of_the_commands_says_what_the_plugin_reads(plugin, tables):
-    table, told = tables[plugin], integrators.PARAMETERS[plugin]
+    table, told = tables[plugin], ours.PARAMETERS[plugin]
     assert told.keys() == table.keys()
     for name, about in table.items():
         assert told[name].allowed == range_in_words(about), name
-        assert integrators.value_text(told[name].default) == about["default"], name
+        assert ours.value_text(told[name].default) == about["default"], name
         if len(about["methods"]) == 1:
             assert told[name].remark == f"for method={about['methods'][0]} only", name
 
 
 def test_methods_are_those_of_the_plugins(tables):
     for table in tables.values():
-        assert tuple(table["method"]["texts"]) == integrators.METHODS
+        assert tuple(table["method"]["texts"]) == ours.METHODS

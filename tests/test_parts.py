@@ -161,7 +161,9 @@ def test_part_that_is_none_is_refused(run, capsys, wrong):
 
 @pytest.mark.parametrize("wrong", [(0, 4), (5, 4), (1,), 3, (1.0, 4), (True, 4), "3/4"])
 def test_part_in_python_that_is_none_is_refused(scene, scalar, wrong):
-    with pytest.raises(UsageError, match=r"must be two integers, \(3, 16\) is the third of 16"):
+    with pytest.raises(
+        UsageError, match=r"must be two integers, 1 <= K <= N <= 1048576, \(3, 16\) is"
+    ):
         manylights.render(str(scene), part=wrong)
 
 
@@ -508,6 +510,20 @@ def test_other_images_are_no_parts(run, two, tmp_path):
     assert f"{tmp_path}/nothing.exr: no such file" in run.merge(tmp_path / "nothing.exr")[1]
 
 
+@pytest.mark.parametrize(
+    ("paths", "words"),
+    [
+        ("a.exr", "paths 'a.exr': must be a list of paths"),
+        (None, "paths None: must be a list of paths"),
+        ([3], "paths 3: must be a path"),
+        (["a.exr"], "^a.exr: no such file$"),
+    ],
+)
+def test_what_are_no_paths_is_named(scalar, paths, words):
+    with pytest.raises(UsageError, match=words):
+        manylights.merge(paths)
+
+
 def test_renders_with_a_target_are_no_parts(run, monkeypatch, tmp_path):
     kept = tmp_path / "a.checkpoint.exr"
     interrupted(monkeypatch, run, "--until-noise", 0.001, "--checkpoint", 1e-6, done=3)
@@ -542,6 +558,48 @@ def test_checkpoint_of_a_whole_render_is_a_part(run, monkeypatch, tmp_path):
     assert status == 2 and "missing: the rest of part 1 of 1 (3 of its" in log
     status, log = run.merge("--partial", kept)
     assert status == 0 and "6 samples per pixel" in log
+
+
+def told(path):
+    """The attributes of a file, but for how long it took, as something to compare."""
+    _, attributes = exr.read(path)
+    del attributes["manylights.seconds_taken"]
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in attributes.items()
+    }
+
+
+def test_merged_parts_say_what_the_whole_says(run, two, tmp_path):
+    """Also where the camera was, and what the integrator's parameters are."""
+    assert run(out="whole.exr")[0] == 0
+    assert run.merge(*two)[0] == 0
+    whole = told(tmp_path / "whole.exr")
+    assert {"worldToCamera", "worldToNDC", "chromaticities", "software"} <= whole.keys()
+    assert "manylights.parameters" in whole and whole["manylights.samples"] == 37
+    assert told(tmp_path / "merged.exr") == whole
+    # Merged in groups it is the same
+    assert run.merge(two[0], "--partial", out="first.exr")[0] == 0
+    assert run.merge(tmp_path / "first.exr", two[1])[0] == 0
+    assert told(tmp_path / "merged.exr") == whole
+
+
+def test_means_say_what_all_their_images_say(run, tmp_path):
+    for seed, spp in ((1, 4), (2, 8)):
+        assert run("--spp", spp, out=f"{seed}.exr", seed=seed)[0] == 0
+    files = [tmp_path / "1.exr", tmp_path / "2.exr"]
+    assert run.merge(*files)[0] == 0
+    first, mean = told(files[0]), told(tmp_path / "merged.exr")
+    assert mean["manylights.samples"] == 12 and exr.fact(mean["manylights.seeds"]) == [1, 2]
+    differing = {name for name in {**first, **mean} if first.get(name) != mean.get(name)}
+    assert differing == {"manylights.samples", "manylights.samples_done", "manylights.seeds"}
+    # Another camera, as of a program that wrote the file anew
+    planes, attributes = exr.read(files[1])
+    attributes["worldToCamera"] = 2 * attributes["worldToCamera"]
+    exr.write(files[1], planes, attributes)
+    assert run.merge(*files)[0] == 0
+    again = told(tmp_path / "merged.exr")
+    assert "worldToCamera" not in again and again["worldToNDC"] == mean["worldToNDC"]
 
 
 def test_images_of_several_seeds_are_averaged_by_samples(run, tmp_path):

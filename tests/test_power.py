@@ -105,6 +105,32 @@ def test_weights_of_the_scene_are_restored_after_an_error(each_variant, probabil
     assert sorted(before) == pytest.approx([0.25, 0.75])
 
 
+@pytest.mark.parametrize(
+    "weights", [[1.0], [1.0, 2.0, 3.0], [[1.0, 2.0]], [1.0, np.nan], [-1.0, 2.0], [0, 0], "ab", 1.0]
+)
+def test_weights_of_other_scenes_are_refused(scalar, probabilities, weights):
+    scene = load(a=point(1, 1, 1), b=point(2, 2, 2))
+    before = probabilities(scene)
+    words = "must be 2 finite numbers of at least 0, one for each emitter, not all of them 0"
+    with pytest.raises(ValueError, match=words), manylights.power_sampling(scene, weights):
+        pass
+    np.testing.assert_array_equal(probabilities(scene), before)
+
+
+def test_weights_may_be_a_list(scalar, probabilities):
+    scene = load(a=point(1, 1, 1), b=point(2, 2, 2))
+    with manylights.power_sampling(scene, [1, 3]):
+        assert sorted(probabilities(scene)) == pytest.approx([0.25, 0.75])
+
+
+def test_what_is_no_scene_is_named(scalar):
+    for wrong in (None, "scene.xml", {"type": "scene"}):
+        with pytest.raises(ValueError, match=r"must be an mi\.Scene of the variant scalar_rgb"):
+            manylights.power_weights(wrong)
+        with pytest.raises(ValueError, match=r"must be an mi\.Scene"):
+            manylights.power_sampling(wrong).__enter__()
+
+
 def test_no_emitter_is_never_chosen(each_variant, probabilities):
     scene = load(a=point(1e9, 1e9, 1e9), b=point(1e-9, 1e-9, 1e-9), c=point(0, 0, 0))
     assert (manylights.power_weights(scene) >= power.FLOOR).all()

@@ -331,17 +331,36 @@ def test_progress_is_told(short_steps, llvm, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"spp": 0}, "spp 0: must be 1 to"),
-        ({"seed": -1}, "seed -1: must be 0 to"),
-        ({"sensor": 1}, "sensor 1: must be 0 to 0"),
+        ({"spp": 0}, "spp 0: must be an integer from 1 to 4294967295"),
+        ({"spp": "many"}, "spp 'many': must be an integer from 1 to 4294967295"),
+        ({"spp": 16.0}, "spp 16.0: must be an integer"),
+        ({"spp": True}, "spp True: must be an integer"),
+        ({"seed": -1}, "seed -1: must be an integer from 0 to 4294967295"),
+        ({"seed": 1.5}, "seed 1.5: must be an integer"),
+        ({"seed": None}, "seed None: must be an integer"),
+        ({"sensor": 1}, "sensor 1: must be an integer from 0 to 0"),
+        ({"sensor": "main"}, "sensor 'main': must be an integer"),
         ({"until_noise": 0.0}, "until_noise 0.0: must be a number above 0"),
         ({"until_noise": float("nan")}, "until_noise nan"),
+        ({"until_noise": "2 %"}, "until_noise '2 %': must be a number above 0"),
         ({"seconds": float("inf")}, "seconds inf"),
+        ({"seconds": "10m"}, "seconds '10m': must be a number above 0"),
         ({"threads": 0}, "threads 0"),
+        ({"threads": "all"}, "threads 'all': must be an integer from 1 to 4096"),
+        ({"threads": 10**9}, "threads 1000000000: must be an integer from 1 to 4096"),
         ({"integrator": 3}, "integrator 3: must be a name"),
+        ({"integrator": {"max_depth": 3}}, """integrator {'max_depth': 3}: must be a dictionary"""),
+        ({"integrator": {"type": "independent"}}, "must be an integrator of Mitsuba or ours"),
+        ({"exposure": "bright"}, "exposure 'bright': must be a number from -64 to 64"),
+        ({"checkpoint": 3}, "checkpoint 3: must be a path"),
+        ({"part": (1, 2), "learnt": 3}, "learnt 3: must be a path"),
+        ({"progress": "bar"}, "progress 'bar': must be a function"),
+        ({"client": "local:2"}, "client 'local:2': must be a synchronous distributed.Client"),
+        ({"tev": 14158}, "tev 14158: must be a text, HOST:PORT"),
         ({"checkpoint": "state.png"}, "checkpoint state.png: it is an OpenEXR file"),
         ({"checkpoint": "no/state.exr"}, "checkpoint no/state.exr: there is no folder no"),
         ({"checkpoint": "state.exr", "checkpoint_seconds": 0}, "checkpoint_seconds 0"),
+        ({"checkpoint": "state.exr", "checkpoint_seconds": "1"}, "checkpoint_seconds '1': must be"),
         ({"output": "image.png"}, "image.png"),
     ],
 )
@@ -354,8 +373,68 @@ def test_bad_arguments_are_named(scalar, options, words):
 def test_bad_scenes_are_named(scalar, tmp_path):
     with pytest.raises(UsageError, match=r"no\.xml: no such file"):
         manylights.render(tmp_path / "no.xml")
-    with pytest.raises(UsageError, match="scene 3: must be a path"):
-        manylights.render(3)
+    with pytest.raises(UsageError, match="'': no such file"):
+        manylights.render("")
+    for scene, shown in ((3, "3"), (None, "None"), ([{}], r"\[\{\}\]")):
+        what = "a path, a dictionary or an mi.Scene of the variant scalar_rgb"
+        with pytest.raises(UsageError, match=f"scene {shown}: must be {what}$"):
+            manylights.render(scene)
+    with pytest.raises(UsageError, match="scene: a dictionary of the type 'sphere', must be"):
+        manylights.render({"type": "sphere"})
+    with pytest.raises(UsageError, match=r"^aovs 3: must be a text with commas"):
+        manylights.render(mi.cornell_box(), aovs=3)
+
+
+def test_values_in_messages_are_short(scalar):
+    with pytest.raises(UsageError) as raised:
+        manylights.render([mi.cornell_box()])
+    assert len(str(raised.value)) < 200 and "\n" not in str(raised.value)
+
+
+def test_paths_in_messages_are_whole(scalar, tmp_path, capsys):
+    path = tmp_path / ("long" * 30) / "a.exr"
+    for learnt in (path, str(path)):
+        with pytest.raises(UsageError) as raised:
+            manylights.render(loaded(), learnt=learnt)
+        assert str(raised.value) == f"learnt '{path}': must be given with part"
+    command = ["render", "", "-o", str(tmp_path / "o.exr"), "--variant", "scalar_rgb"]
+    assert cli.main(command) == 2
+    assert "manylights: '': no such file" in capsys.readouterr().err
+
+
+def test_scenes_without_an_integrator_need_one(scalar):
+    scene = {"type": "scene", "sensor": {"type": "perspective"}, "lamp": {"type": "constant"}}
+    scene["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4}
+    made = mi.load_dict(scene)
+    for arguments in ((made, None), (made, "keep"), (scene, "keep")):
+        with pytest.raises(UsageError, match=r'has no integrator, name one \(integrator="NAME"'):
+            manylights.render(arguments[0], spp=1, integrator=arguments[1])
+    assert manylights.render(made, spp=1, integrator="path").image.mean() == 1.0
+    assert manylights.render(scene, spp=1).image.mean() == 1.0
+
+
+def test_numbers_of_numpy_are_those_of_python(scalar, tmp_path):
+    scene = loaded("points", 8, 6)
+    plain = manylights.render(scene, spp=2, seed=3, output=tmp_path / "plain.exr")
+    numbers = {"spp": np.int64(2), "seed": np.uint32(3), "sensor": np.int8(0)}
+    same = manylights.render(scene, **numbers, threads=np.int64(2), output=tmp_path / "same.exr")
+    assert same.image.tobytes() == plain.image.tobytes()
+    noise = {"until_noise": np.float32(9.0), "seed": 3}
+    assert manylights.render(scene, **noise, output=tmp_path / "noise.exr").noise < 9.0
+
+
+def test_without_a_variant_the_error_says_what_to_do(monkeypatch):
+    monkeypatch.setattr(mi, "variant", lambda: None)
+    calls = (
+        lambda: manylights.render("scene.xml"),
+        lambda: manylights.merge(["a.exr"]),
+        lambda: manylights.mix("a.exr", {}, "b.exr"),
+        lambda: manylights.merge_emitters({}),
+        lambda: manylights.power_weights(None),
+    )
+    for call in calls:
+        with pytest.raises(RuntimeError, match=r'call mitsuba\.set_variant\("llvm_ad_rgb"\)'):
+            call()
 
 
 @pytest.mark.parametrize(

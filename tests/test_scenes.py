@@ -198,6 +198,17 @@ def test_thin_fog_changes_little_and_dense_fog_hides_all(scalar):
         (lambda: scenes.fog_open(10, kind="quads"), "points, mesh"),
         (lambda: scenes.fog_open(10, mean_free_path=0.0), "mean_free_path"),
         (lambda: scenes.fog_rooms(10, g=1.0), "g=1.0"),
+        (lambda: scenes.city("many"), "n_lights='many': must be an integer from 1 to 1,000,000"),
+        (lambda: scenes.city(float("nan")), "n_lights=nan: must be an integer"),
+        (lambda: scenes.house(10, seed=-1), "seed=-1: must be an integer of at least 0"),
+        (lambda: scenes.coincident(10, seed=None), "seed=None: must be an integer"),
+        (lambda: scenes.bulbs(10, width=0), "width=0: must be an integer of at least 1"),
+        (lambda: scenes.bulbs(10, height=9.5), "height=9.5: must be an integer of at least 1"),
+        (lambda: scenes.open_plane(10, spp="1"), "spp='1': must be an integer of at least 1"),
+        (lambda: scenes.city(10, integrator=None), "integrator=None: must be the name of a plugin"),
+        (lambda: scenes.glossy(10, roughness="smooth"), "roughness='smooth': must be above 0"),
+        (lambda: scenes.rooms(10, per_room=None), "per_room=None: must be an integer"),
+        (lambda: scenes.fog_open(10, mean_free_path="1"), "mean_free_path='1': must be above 0"),
     ],
 )
 def test_wrong_arguments_are_named(scalar, call, words):

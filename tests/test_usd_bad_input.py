@@ -54,6 +54,23 @@ def test_missing_file(usd, tmp_path, name):
         usd.load(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("choices", "words"),
+    [
+        ({"time": "noon"}, "time 'noon': must be a finite number"),
+        ({"time": float("nan")}, "time nan: must be a finite number"),
+        ({"purposes": 3}, "purposes 3: must be a list of default, render, proxy, guide"),
+        ({"subdivision": 1.5}, "subdivision 1.5: must be an integer from 0 to 6"),
+        ({"subdivision": 7}, "subdivision 7: must be an integer from 0 to 6"),
+        ({"path": None}, "path None: must be a path"),
+    ],
+)
+def test_arguments_of_wrong_types_are_named(usd, tmp_path, choices, words):
+    stage = write_stage(tmp_path, LIT)
+    with pytest.raises(ValueError, match=words):
+        usd.load(**{"path": stage, **choices})
+
+
 def test_folder(usd, tmp_path):
     with pytest.raises(ValueError, match="folder"):
         usd.load(tmp_path)

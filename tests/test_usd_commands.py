@@ -144,9 +144,10 @@ def test_lamps_of_converted_stage_keep_their_colours(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--camera", "/World/nowhere"], "/World/nowhere"),
-        (["--time", "noon"], "noon: must be a number"),
-        (["--subdivision", "9"], "9: must be from 0 to 6"),
+        (["--camera", "/World/nowhere"], "--camera /World/nowhere: no such prim; the stage has"),
+        (["--light-groups", "key=/Nowhere"], '--light-groups: "key=/Nowhere" matches no light'),
+        (["--time", "noon"], "--time noon: must be a number"),
+        (["--subdivision", "9"], "--subdivision 9: must be an integer from 0 to 6"),
         (["-D", "spp=4"], "-D spp"),
     ],
 )

@@ -603,7 +603,7 @@ def test_nothing_is_noted_where_nothing_is_lost(load, attributes):
 def test_stage_without_light(load):
     text = f'def Mesh "quad" {{;{QUAD}}}'
     scene = load(text)
-    assert "--default-light" in note(scene, "no light")
+    assert "without default_light=True" in note(scene, "no light")
     scene = load(text, default_light=True)
     assert color(emitters(scene, "constant")[0]["radiance"]) == pytest.approx([1] * 3)
     assert re.search("constant environment", note(scene, "no light"))

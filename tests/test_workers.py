@@ -341,7 +341,7 @@ def test_absolute_names_cannot_be_sent(client, scene, tmp_path, scalar):
     text = scene.read_text()
     assert '"data/bulbs.ply"' in text
     scene.write_text(text.replace("data/bulbs.ply", str(mesh)))
-    with pytest.raises(UsageError, match=rf"--ship: .*scene.xml names {mesh}, which is elsewhere"):
+    with pytest.raises(UsageError, match=rf"^ship: .*scene.xml names {mesh}, which is elsewhere"):
         manylights.render(scene, spp=37, client=client, ship=True)
 
 

@@ -1,8 +1,27 @@
-"""Errors that the command line shows as one line."""
+"""Errors of users, which the command shows as one line: what they typed, and what is allowed."""
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from numbers import Integral, Real
+from typing import Any
+
+#: Options that are not called as the arguments are in Python.
+OPTIONS = {
+    "output": "-o",
+    "defines": "-D",
+    "aovs": "--aov",
+    "seconds": "--for",
+    "client": "--workers",
+}
+
+#: Characters of a value in a message, at most.
+MOST_SHOWN = 60
+
+_in_shell = False
 
 
 class UsageError(ValueError):
@@ -14,3 +33,70 @@ def one_line(error: BaseException) -> str:
     text = re.sub(r"\[[\w.]+:\d+\] ", "", str(error))
     text = " ".join(text.split())
     return text or type(error).__name__
+
+
+@contextmanager
+def in_shell() -> Iterator[None]:
+    """Context in which messages are for who typed a command, and not for who called a function.
+
+    That of the whole process: renders have threads of their own.
+    """
+    global _in_shell
+    before, _in_shell = _in_shell, True
+    try:
+        yield
+    finally:
+        _in_shell = before
+
+
+def typed(python: str, shell: str) -> str:
+    """Return how the user would type something: in Python, or in the shell."""
+    return shell if _in_shell else python
+
+
+def argument(name: str) -> str:
+    """Return what the user calls an argument: ``light_groups``, or ``--light-groups``."""
+    return typed(name, OPTIONS.get(name, f"--{name.replace('_', '-')}"))
+
+
+def shown(value: Any) -> str:
+    """Return a value as the user typed it; objects on one line that is not too long."""
+    if _in_shell:
+        return str(value) or "''"
+    if isinstance(value, (os.PathLike, str)):
+        return repr(str(value))
+    text = " ".join(repr(value).split())
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
+
+
+def check(name: str, value: Any, allowed: bool, what: str) -> None:
+    """Raise ``UsageError`` with argument, value and what it must be, unless it is allowed."""
+    if not allowed:
+        raise UsageError(f"{argument(name)} {shown(value)}: must be {what}")
+
+
+def is_integer(value: Any) -> bool:
+    """Is it an integer of any kind, as of NumPy, and not True or False?"""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def integer(name: str, value: Any, least: int, most: int) -> int:
+    """Return an integer of any kind as one of Python.
+
+    Raises:
+        UsageError: none, or one that is not in ``least`` to ``most``.
+    """
+    allowed = is_integer(value) and least <= int(value) <= most
+    check(name, value, allowed, f"an integer from {least} to {most}")
+    return int(value)
+
+
+def number(name: str, value: Any, allowed: Callable[[Any], bool], what: str) -> float:
+    """Return a real number of any kind, as of NumPy, as one of Python.
+
+    Raises:
+        UsageError: none, as ``True``, or one that is not allowed; ``what`` says which are.
+    """
+    real = isinstance(value, Real) and not isinstance(value, bool)
+    check(name, value, real and allowed(value), what)
+    return float(value)

@@ -9,33 +9,44 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument, check
 
 
-def check_output(path: str, kind: str = "", ending: str = "") -> Path:
-    """Return ``path``, the value of ``-o``, if a file can be written there.
+def path_of(name: str, value: str | Path) -> Path:
+    """Return the path that an argument is.
+
+    Raises:
+        UsageError: something else.
+    """
+    check(name, value, isinstance(value, (str, os.PathLike)), "a path")
+    return Path(value)
+
+
+def check_output(path: str, kind: str = "", ending: str = "", named: bool = True) -> Path:
+    """Return ``path``, the argument ``output``, if a file can be written there.
 
     Args:
         path: where to write.
         kind: what the file is, for the message about its ending: "the image is an OpenEXR file".
         ending: how the name has to end, as in ".exr". Default: any.
+        named: does the command have an option for it, which messages name?
 
     Raises:
         UsageError: another ending, no such folder, a folder of that name, or no permission.
     """
-    target = Path(path)
+    target, name = Path(path), f"{argument('output')} " if named else ""
     if ending and target.suffix.lower() != ending:
-        raise UsageError(f"-o {path}: {kind}, end the name in {ending}")
+        raise UsageError(f"{name}{path}: {kind}, end the name in {ending}")
     if not target.parent.is_dir():
-        raise UsageError(f"-o {path}: there is no folder {target.parent}")
+        raise UsageError(f"{name}{path}: there is no folder {target.parent}")
     if target.is_dir():
-        raise UsageError(f"-o {path}: not writable, it is a folder")
+        raise UsageError(f"{name}{path}: not writable, it is a folder")
     # Permissions do not tell: nothing binds root, and not all that root may is possible.
     try:
         with tempfile.TemporaryFile(dir=target.parent):
             return target
     except OSError as error:
-        raise UsageError(f"-o {path}: not writable ({error.strerror})") from error
+        raise UsageError(f"{name}{path}: not writable ({error.strerror})") from error
 
 
 #: Held while a file is written; who ends the process takes it first.

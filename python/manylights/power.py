@@ -21,6 +21,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from manylights.errors import check
+from manylights.threads import require_variant
+
 #: Rays for each emitter: a textured one needs some, all others are exact with one.
 SAMPLES = 64
 
@@ -35,7 +38,11 @@ def power_weights(scene) -> np.ndarray:
     The weights are the powers, averaged over channels, divided by their mean, and at least
     ``FLOOR``. Emitters of unknown power, those that cannot send out rays, get the weight 1.
     Without any power all weights are 1.
+
+    Raises:
+        UsageError: (a ``ValueError``) it is no ``mi.Scene`` of the current variant.
     """
+    _check_scene(scene)
     powers = _emitter_powers(scene)
     known = np.isfinite(powers)
     mean = powers[known].mean() if known.any() else 0.0
@@ -55,16 +62,38 @@ def power_sampling(scene, weights: np.ndarray | None = None):
         weights: what ``power_weights`` returned for this scene. Default: computed here.
 
     Raises:
+        UsageError: (a ``ValueError``) the scene is none, or the weights are not those of its
+            emitters.
         RuntimeError: Mitsuba's probabilities do not follow the weights.
     """
-    weights = power_weights(scene) if weights is None else weights
+    weights = power_weights(scene) if weights is None else _checked(scene, weights)
     before = np.array([emitter.sampling_weight() for emitter in scene.emitters()])
-    _set_weights(scene, weights)
     try:
+        _set_weights(scene, weights)
         _check_probabilities(scene, weights)
         yield
     finally:
         _set_weights(scene, before)
+
+
+def _check_scene(scene) -> None:
+    require_variant()
+    what = f"an mi.Scene of the variant {mi.variant()}"
+    check("scene", scene, isinstance(scene, mi.Scene), what)
+
+
+def _checked(scene, weights) -> np.ndarray:
+    """Return weights that a user gave, if there is one for each emitter."""
+    _check_scene(scene)
+    count = len(scene.emitters())
+    try:
+        found = np.asarray(weights, float)
+    except (TypeError, ValueError):
+        found = np.full(count, np.nan)
+    fits = found.shape == (count,) and bool(np.isfinite(found).all() and (found >= 0.0).all())
+    what = f"{count} finite numbers of at least 0, one for each emitter, not all of them 0"
+    check("weights", weights, fits and (found.any() or not count), what)
+    return found
 
 
 def _set_weights(scene, weights: np.ndarray) -> None:

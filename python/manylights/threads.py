@@ -1,4 +1,4 @@
-"""What Mitsuba computes with: the number of threads, and on which processor."""
+"""What Mitsuba computes with: variant, number of threads, processor."""
 
 from __future__ import annotations
 
@@ -6,6 +6,19 @@ import platform
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
+
+#: More are no use, and Linux does not start them.
+MOST_THREADS = 4096
+
+
+def require_variant() -> None:
+    """Raise RuntimeError if no variant is set, where Mitsuba itself would not say so."""
+    if mi.variant() is None:
+        raise RuntimeError(
+            "no variant of Mitsuba is set: call "
+            'mitsuba.set_variant("llvm_ad_rgb") or another one first'
+        )
 
 
 class thread_count:

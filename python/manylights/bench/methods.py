@@ -15,7 +15,7 @@ from typing import Any
 import mitsuba as mi
 
 from manylights.errors import UsageError, one_line
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.output import channels, denoise
 
 
@@ -34,7 +34,7 @@ class About:
     marker: str
 
 
-#: All methods, in the order of charts. A new one of ours is added to ``integrators.METHODS``, too.
+#: All methods, in the order of charts. A new one of ours is added to ``ours.METHODS``, too.
 ABOUT = {
     "resampled_tree": About(
         "ours with its default settings: equidistant points descend the tree, and the lights they "
@@ -62,15 +62,13 @@ ABOUT = {
 }
 
 #: Names of methods: values of our parameter ``method``, and Mitsuba's integrators.
-OURS = integrators.METHODS
+OURS = ours.METHODS
 MITSUBAS = tuple(name for name in ABOUT if name not in OURS)
 NAMES = (*MITSUBAS, *OURS)
 
 #: Parameters that sweeps are made of.
 SWEPT = {
-    name: parameter
-    for name, parameter in integrators.SAMPLING_PARAMETERS.items()
-    if parameter.symbol
+    name: parameter for name, parameter in ours.SAMPLING_PARAMETERS.items() if parameter.symbol
 }
 
 #: More lights would take hours with ``exhaustive``, which evaluates them all at every point.
@@ -79,7 +77,7 @@ EXHAUSTIVE_LIGHTS = 10_000
 #: Parameters that a method may have: what makes up the method, not what is measured about it.
 PARAMETERS = {
     name: parameter
-    for name, parameter in integrators.SAMPLING_PARAMETERS.items()
+    for name, parameter in ours.SAMPLING_PARAMETERS.items()
     if name not in ("method", "counts")
 }
 
@@ -100,7 +98,7 @@ class Method:
     def spec(self) -> str:
         """The method as text, always the same for the same method."""
         return ":".join(
-            [self.name, *(f"{k}={integrators.value_text(v)}" for k, v in self.parameters.items())]
+            [self.name, *(f"{k}={ours.value_text(v)}" for k, v in self.parameters.items())]
         )
 
     @property
@@ -124,7 +122,7 @@ class Kind:
     @property
     def ours(self) -> str:
         """Our integrator for this."""
-        return integrators.DIRECT if self.peer == "direct" else integrators.VOLPATH
+        return ours.DIRECT if self.peer == "direct" else ours.VOLPATH
 
     @property
     def max_depth(self) -> int | None:
@@ -186,16 +184,16 @@ def kind_of(plugin: str, parameters: dict[str, Any], media: bool) -> Kind:
     """
     known = ("max_depth", "rr_depth", "hide_emitters")
     kept = {name: parameters[name] for name in known if name in parameters}
-    if plugin in ("direct", integrators.DIRECT):
+    if plugin in ("direct", ours.DIRECT):
         hidden = {name: value for name, value in kept.items() if name == "hide_emitters"}
         return Kind("direct", hidden)
     if plugin == "volpathmis" and media:
         return Kind("volpathmis", kept)
-    if plugin in ("path", "volpath", "volpathmis", integrators.VOLPATH):
+    if plugin in ("path", "volpath", "volpathmis", ours.VOLPATH):
         return Kind("volpath" if media else "path", kept)
     raise UsageError(
         f"integrator {plugin}: can compare direct, path, volpath, volpathmis, "
-        f"{integrators.DIRECT} and {integrators.VOLPATH} only"
+        f"{ours.DIRECT} and {ours.VOLPATH} only"
     )
 
 
@@ -212,7 +210,7 @@ def with_guides(integrator: dict[str, Any]) -> dict[str, Any]:
     Ours has the parameter ``aovs``; Mitsuba's are nested in its ``aov``, with paths that end at the
     first surface for the emission in sight.
     """
-    if integrator["type"] in integrators.PARAMETERS:
+    if integrator["type"] in ours.PARAMETERS:
         return {**integrator, "aovs": channels.aov_list((denoise.EMISSION, *denoise.GUIDES))}
     peer = "path" if integrator["type"] == "direct" else integrator["type"]
     sight = {**integrator, "type": peer, "max_depth": 1}
@@ -221,7 +219,7 @@ def with_guides(integrator: dict[str, Any]) -> dict[str, Any]:
 
 
 def _value(name: str, text: str) -> Any:
-    value = integrators.parse_value(text)
+    value = ours.parse_value(text)
     if isinstance(value, float) and math.isinf(value):
         # As text, which the plugins read, since JSON has no infinity.
         return "inf"

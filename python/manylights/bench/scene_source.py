@@ -28,7 +28,7 @@ import mitsuba as mi
 from manylights import lights, loading, scenes
 from manylights.bench import methods, samplers
 from manylights.errors import UsageError, one_line
-from manylights.loading import integrators
+from manylights.loading import integrators, ours
 from manylights.loading.parsing import USD_ENDINGS
 from manylights.threads import threads_for_files
 
@@ -194,7 +194,7 @@ def _parse_call(text: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
         if not equals or not key:
             raise UsageError(f"{text}: write {item!r} as KEY=VALUE")
         target = settings if key in ("integrator", *INTEGRATOR_KEYS) else arguments
-        target[key] = integrators.parse_value(value)
+        target[key] = ours.parse_value(value)
     return name, arguments, settings
 
 

@@ -27,13 +27,14 @@ Renders scenes with several methods of choosing lights and measures times and er
 SCENE is an XML file, a USD stage, or a generator of manylights.scenes:
 NAME[:LIGHTS][,KEY=VALUE]..., as in city:1000,kind=points or
 rooms:1000,integrator=path,max_depth=6. Pictures of generators have 160 x 90 pixels unless
-width and height say otherwise. The scene's own
-sampler does not matter: our methods have manylights_sobol, Mitsuba's integrators the best of
-independent, multijitter, orthogonal and ldsampler.
+width and height say otherwise. The scene's own sampler does not matter: our methods have
+manylights_sobol, Mitsuba's integrators the best of independent, multijitter, orthogonal and
+ldsampler.
 
 A method is NAME[:PARAMETER=VALUE]..., as in talk:splitting_rate=4:split_function=far.
 uniform and power are Mitsuba's own direct, path or volpath, which choose emitters with the
-scene's weights, or in proportion to their power; the others are methods of ours.
+scene's weights, or in proportion to their power. Methods of ours are resampled_tree, talk,
+adaptive_splitting, tree and exhaustive.
 
 Each method is rendered with several numbers of samples and seeds, and once with as many
 samples as take the time budget. Times are those of later renders; that of the first one,
@@ -138,6 +139,8 @@ def _tasks(options) -> list[runner.Task]:
         UsageError: no scene, an unknown one, an unknown method, a reference for several scenes.
     """
     defines, stage = shared.defines(options), shared.usd_options(options)
+    if defines and not any(text.lower().endswith(".xml") for text in options.scene + options.also):
+        raise UsageError(f"-D {next(iter(defines))}: no SCENE is an XML file, only these have them")
     chosen = _methods(options.methods)
     tasks = standard.standard() if options.standard else standard.quick() if options.quick else []
     if chosen is not None:
@@ -178,6 +181,4 @@ def _sample_counts(text: str) -> list[int]:
 
 
 def _seeds(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least 1, the number of seeds")
-    return int(text)
+    return shared.integer(text, 1, None, "at least 1, the number of seeds")

@@ -31,14 +31,16 @@ def add(commands, common) -> None:
     parser.add_argument("stage", metavar="STAGE", help="USD stage")
     parser.add_argument("output", metavar="OUT.xml", help="file to write")
     shared.add_usd(parser)
-    parser.add_argument("--variant", default="scalar_rgb", help="(default: scalar_rgb)")
+    shared.add_scalar_variant(parser)
     parser.set_defaults(command=_run)
 
 
 def _run(options) -> None:
     if not options.stage.lower().endswith(USD_ENDINGS):
         raise UsageError(f"{options.stage}: not a USD stage ({', '.join(USD_ENDINGS)})")
-    target = files.check_output(options.output, "Mitsuba's scenes are XML files", ".xml")
+    target = files.check_output(
+        options.output, "Mitsuba's scenes are XML files", ".xml", named=False
+    )
     usd = import_usd(options.stage)
     loading.set_variant(options.variant)
     with waiting("loading"):

@@ -7,9 +7,10 @@ import mitsuba as mi
 from manylights import lights, loading, scenes
 from manylights.cli import options as shared
 from manylights.cli.render import render_to
-from manylights.loading import integrators, samplers
+from manylights.loading import integrators, ours, samplers
 from manylights.output import images
 from manylights.progress import say
+from manylights.scenes._build import MOST_LIGHTS
 
 HELP = """\
 Generates a city at night with thousands of lights, renders it, and says how long that took.
@@ -26,7 +27,10 @@ def add(commands, common) -> None:
     )
     positive = shared.positive
     parser.add_argument(
-        "--lights", type=positive, default=20000, help="number of lights (default: 20000)"
+        "--lights",
+        type=_lights,
+        default=20000,
+        help=f"number of lights, at most {MOST_LIGHTS:,} (default: 20000)",
     )
     parser.add_argument(
         "--spp", type=positive, help="samples per pixel (default: 64, scalar variants 16)"
@@ -38,7 +42,7 @@ def add(commands, common) -> None:
 
 
 def _run(options) -> None:
-    target = images.check_output(f"{options.output}.exr")
+    target = images.check_output(f"{options.output.removesuffix('.exr')}.exr")
     variant = shared.start(options)
     spp = options.spp or (16 if variant.startswith("scalar") else 64)
     description = scenes.city(
@@ -47,7 +51,7 @@ def _run(options) -> None:
         width=options.width,
         height=options.height,
         spp=spp,
-        integrator={"type": integrators.DIRECT, "block_size": integrators.BLOCK_SIZE},
+        integrator={"type": ours.DIRECT, "block_size": integrators.BLOCK_SIZE},
     )
     description["sensor"]["sampler"]["type"] = samplers.SOBOL
     loaded = loading.LoadedScene(mi.load_dict(description), 1, [])
@@ -56,3 +60,7 @@ def _run(options) -> None:
     wanted = {"spp": spp, "seed": options.seed, "threads": options.threads}
     seconds = render_to(loaded, target, wanted).seconds
     print(f"{count:,} lights, {options.width}x{options.height}, {spp} spp: {seconds:.1f} s")
+
+
+def _lights(text: str) -> int:
+    return shared.integer(text, 1, MOST_LIGHTS, f"an integer from 1 to {MOST_LIGHTS:,}")

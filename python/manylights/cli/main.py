@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 
 import shtab
@@ -21,7 +22,7 @@ from manylights.cli import (
     tree,
     version,
 )
-from manylights.errors import one_line
+from manylights.errors import in_shell, one_line
 from manylights.progress import INTERRUPTED
 
 #: Exit status of a command that could not do what was asked.
@@ -40,6 +41,22 @@ Renders scenes with very many lights. `manylights COMMAND --help` has more.
 COMMANDS = (render, merge, mix, info, tree, convert, demo, bench, compare, report)
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as all others are."""
+
+    def error(self, message: str):
+        """End the process with what is wrong, and where to read what is right."""
+        text = re.sub(r"^argument (\S+): ", r"\1 ", message)
+        self.exit(FAILURE, f"{self.prog}: {text} (see {self.prog} --help)\n")
+
+    def parse_known_args(self, args=None, namespace=None):
+        """Parse; what a command does not know is its own error and not that of all."""
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unknown: {' '.join(unknown)}")
+        return options, unknown
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return the exit status: 0, 2 for errors, 130 after Ctrl-C.
 
@@ -56,9 +73,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(version.describe(options.verbose))
         return 0
     if options.command is None:
-        made.error("which COMMAND? One of those that `manylights --help` lists")
+        made.error("which COMMAND?")
     try:
-        return options.command(options) or 0
+        with in_shell():
+            return options.command(options) or 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -68,7 +86,8 @@ def main(arguments: list[str] | None = None) -> int:
     except Exception as error:
         if options.debug:
             raise
-        print(f"manylights: {one_line(error)}", file=sys.stderr)
+        text = one_line(error).removeprefix("manylights: ")
+        print(f"manylights: {text}", file=sys.stderr)
         return FAILURE
 
 
@@ -76,7 +95,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands; what it parses has the function ``command``."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
-    made = argparse.ArgumentParser(
+    made = Parser(
         prog="manylights",
         description=HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from manylights.cli import options as shared
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.output import images
 from manylights.progress import say
 from manylights.rendering.mix import mix
@@ -27,7 +27,7 @@ named stay as they are; manylights info IMAGE.exr lists them.
 
 All is exact, in single precision: each layer is multiplied, and the image is the sum of the
 layers in the order of their names. The output has the layers, too, and can be mixed again.
-What belongs to the render alone (variance, a denoised image) is left out.
+What belongs to the render alone (variance, emission, a denoised image) is left out.
 """
 
 
@@ -52,7 +52,7 @@ def add(commands, common) -> None:
 def _run(options) -> None:
     mi.set_variant("scalar_rgb")
     images.check_output(options.output)
-    texts = integrators.parse_assignments(options.weights, "mix")
+    texts = ours.parse_assignments(options.weights, "group")
     if len(texts) < len(options.weights):
         raise UsageError("mix: a group is given twice")
     weights = {name: _weight(name, text) for name, text in texts.items()}

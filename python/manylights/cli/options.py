@@ -8,10 +8,11 @@ import math
 import shtab
 
 from manylights import loading
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.loading.parsing import MOST_SUBDIVISION
 from manylights.progress import say
 from manylights.rendering.parts import MOST_PARTS, Part
+from manylights.threads import MOST_THREADS
 
 VARIANT_HELP = "Mitsuba's variant (default: llvm_ad_rgb with libLLVM, else scalar_rgb)"
 
@@ -61,12 +62,18 @@ def add_usd(parser) -> None:
     )
 
 
+def add_scalar_variant(parser) -> None:
+    """Add the variant of a command that renders next to nothing."""
+    what = "Mitsuba's variant (default: scalar_rgb)"
+    parser.add_argument("--variant", default="scalar_rgb", help=what)
+
+
 def add_machine(parser) -> None:
     """Add what a render is done with: seed, variant, threads."""
     group = parser.add_argument_group("random numbers and machine")
     group.add_argument("--seed", type=seed, default=0, help="0 to 4294967295 (default: 0)")
     group.add_argument("--variant", help=VARIANT_HELP)
-    group.add_argument("--threads", type=positive, help="CPU threads of the render (default: all)")
+    group.add_argument("--threads", type=threads, help="CPU threads of the render (default: all)")
 
 
 def add_exposure(parser) -> None:
@@ -86,7 +93,7 @@ def defines(options) -> dict[str, str]:
     Raises:
         UsageError: one is not NAME=VALUE.
     """
-    return integrators.parse_assignments(options.define, "-D")
+    return ours.parse_assignments(options.define, "-D")
 
 
 def usd_options(options) -> loading.UsdOptions:
@@ -117,25 +124,38 @@ def start(options) -> str:
 
 def positive(text: str) -> int:
     """An integer of at least 1."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
-    return value
+    return integer(text, 1, None, "an integer of at least 1")
 
 
 def seed(text: str) -> int:
     """A seed of 32 bits."""
-    value = int(text)
-    if not 0 <= value < 2**32:
-        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to 4294967295")
-    return value
+    return integer(text, 0, 2**32 - 1, "an integer from 0 to 4294967295")
+
+
+def threads(text: str) -> int:
+    """A number of threads."""
+    return integer(text, 1, MOST_THREADS, f"an integer from 1 to {MOST_THREADS}")
+
+
+def index(text: str) -> int:
+    """A place in a list."""
+    return integer(text, 0, None, "an integer of at least 0")
+
+
+def integer(text: str, least: int, most: int | None, allowed: str) -> int:
+    """An integer in a range, which is said in words."""
+    try:
+        value = int(text)
+        if least <= value and (most is None or value <= most):
+            return value
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text}: must be {allowed}")
 
 
 def levels(text: str) -> int:
     """A number of refinements: each makes four times as many faces."""
-    if not text.isdigit() or int(text) > MOST_SUBDIVISION:
-        raise argparse.ArgumentTypeError(f"{text}: must be from 0 to {MOST_SUBDIVISION}")
-    return int(text)
+    return integer(text, 0, MOST_SUBDIVISION, f"an integer from 0 to {MOST_SUBDIVISION}")
 
 
 def time_code(text: str) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 from manylights import loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
-from manylights.loading import integrators
+from manylights.loading import ours
 from manylights.output import channels, denoise, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
 from manylights.rendering import Progress, RenderResult, live, render
@@ -88,7 +88,9 @@ def add(commands, common) -> None:
     )
     shared.add_scene(parser)
     parser.add_argument("-o", "--output", required=True, metavar="OUT.exr", help="image to write")
-    parser.add_argument("--sensor", type=int, default=0, help="index of the sensor (default: 0)")
+    parser.add_argument(
+        "--sensor", type=shared.index, default=0, help="index of the sensor (default: 0)"
+    )
     _add_targets(parser)
     method = parser.add_argument_group("integrator and sampler")
     method.add_argument(
@@ -215,7 +217,7 @@ def _add_targets(parser) -> None:
 def _parameter_help() -> str:
     """Return the parameters of our integrators as a table for the help."""
     lines = []
-    for plugin, parameters in integrators.PARAMETERS.items():
+    for plugin, parameters in ours.PARAMETERS.items():
         lines += ["", f"parameters of {plugin}:"]
         width = max(map(len, parameters))
         for name, parameter in parameters.items():
@@ -228,13 +230,14 @@ def _parameter_help() -> str:
 def _run(options) -> None:
     target = images.check_output(options.output)
     defines = shared.defines(options)
-    settings = integrators.parse_assignments(options.set, "--set")
-    settings = {name: integrators.parse_value(text) for name, text in settings.items()}
+    settings = ours.parse_assignments(options.set, "--set")
+    settings = {name: ours.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
         settings["hide_emitters"] = True
     if options.denoise:
         denoise.check_installed()
-    settings |= Extras(options.aov, options.light_groups, options.denoise).parameters("--aov")
+    extras = Extras(options.aov, options.light_groups, options.denoise)
+    settings = ours.joined(settings, extras.parameters())
     shared.start(options)
     if options.workers is None:
         if options.ship:
@@ -258,7 +261,7 @@ def _load_and_render(options, target: Path, defines, settings, connection=None) 
     for note in loaded.notes:
         say(note)
     count = len(loaded.scene.sensors())
-    if not 0 <= options.sensor < count:
+    if options.sensor >= count:
         has = f"0 to {count - 1} are there" if count > 1 else "there is number 0 alone"
         raise UsageError(
             f"--sensor {options.sensor}: {has}" if count else f"{options.scene}: has no sensor"

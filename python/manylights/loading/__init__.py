@@ -2,6 +2,7 @@
 
 - ``variants``: which of Mitsuba's variants this machine can run;
 - ``parsing``: XML or USD to Mitsuba's parsed form, and from there to objects;
+- ``ours``: names and parameters of our integrators;
 - ``integrators``: replaces Mitsuba's integrators by ours and sets parameters;
 - ``light_groups``: names of groups of lights, which are merged within a group alone;
 - ``samplers``: replaces Mitsuba's sampler by ours;

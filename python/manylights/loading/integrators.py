@@ -7,88 +7,23 @@ are found like any other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument, typed
 from manylights.loading import light_groups
-from manylights.output import channels
-
-#: Our plugins: direct light on surfaces, and paths through surfaces and media.
-DIRECT, VOLPATH = "manylights_direct", "manylights_volpath"
-
-#: Values of the parameter ``method``, the default first.
-METHODS = ("resampled_tree", "talk", "adaptive_splitting", "tree", "exhaustive")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """What a parameter of ours may be, for help and error messages. The plugins check values.
-
-    Attributes:
-        allowed: type and range, in words.
-        default: of the plugins.
-        remark: what else is to be known.
-        symbol: in formulas, for charts of parameters that are swept.
-    """
-
-    allowed: str
-    default: Any
-    remark: str = ""
-    symbol: str = ""
-
-    def __str__(self) -> str:
-        remark = f", {self.remark}" if self.remark else ""
-        return f"{self.allowed}, default {value_text(self.default) or 'none'}{remark}"
-
-
-class Wish(str):
-    """A value to set on our integrators, which others do without."""
-
-
-BOOLEAN = "true or false"
-HIDE_EMITTERS = Parameter(BOOLEAN, False)
-
-#: What both plugins accept to steer and to watch the choice of lights.
-SAMPLING_PARAMETERS = {
-    "splitting_rate": Parameter("float >= 0 or inf", 1.0, symbol="gamma"),
-    "reservoirs": Parameter("integer from 1 to 64", 16, symbol="m"),
-    "shadow_rays": Parameter("integer from 1 to the number of reservoirs", 16, symbol="s"),
-    "method": Parameter(f"{', '.join(METHODS[:-1])} or {METHODS[-1]}", METHODS[0]),
-    "split_function": Parameter("near or far", "near", "for method=talk only"),
-    "learn_visibility": Parameter("true, false or keep", True, f"for method={METHODS[0]} only"),
-    "counts": Parameter(BOOLEAN, False, f"adds channels {', '.join(channels.COUNTS)}"),
-    "light_groups": Parameter("text", "", "layers with their light, as key=lamp_*,windows=facade"),
-}
-
-#: Channels that describe the surfaces in sight.
-AOVS = Parameter(
-    "NAME:TYPE between commas with the TYPE albedo, depth, position, uv, geo_normal, sh_normal, "
-    "dp_du, dp_dv, duv_dx, duv_dy, prim_index, shape_index or emission",
-    "",
+from manylights.loading.ours import (
+    BASE_PARAMETERS,
+    DIRECT,
+    PARAMETERS,
+    SAMPLING_PARAMETERS,
+    VOLPATH,
+    Wish,
+    called,
+    check_type,
+    with_wish,
 )
-
-#: What each plugin accepts.
-PARAMETERS = {
-    DIRECT: {
-        **SAMPLING_PARAMETERS,
-        "aovs": AOVS,
-        "bsdf_samples": Parameter("integer from 0 to 1024", 1),
-        "hide_emitters": HIDE_EMITTERS,
-    },
-    VOLPATH: {
-        "max_depth": Parameter("integer, -1 for no limit", -1),
-        "rr_depth": Parameter("integer >= 1", 5),
-        **SAMPLING_PARAMETERS,
-        "aovs": AOVS,
-        "hide_emitters": HIDE_EMITTERS,
-    },
-}
-
-#: Parameters of Mitsuba's own base classes, accepted too.
-BASE_PARAMETERS = ("block_size", "samples_per_pass", "timeout")
 
 #: Integrators that render an image in blocks, and Mitsuba's own size of them, in pixels.
 USING_BLOCKS = (
@@ -112,45 +47,7 @@ SHARED_PARAMETERS = (
 PASSED_STRAIGHT_ON = ("mask", "null", "thindielectric")
 
 #: Why an integrator stays that one of ours could replace.
-STAYS = {"volpathmis": f" stays: {VOLPATH} has no spectral MIS (--integrator {VOLPATH} uses it)"}
-
-
-def parse_value(text: str) -> bool | int | float | str:
-    """Interpret the right-hand side of ``--set name=value``.
-
-    ``true`` and ``false`` give booleans; then integers, floats (``inf`` included) and plain text
-    are tried in this order.
-    """
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
-
-
-def value_text(value: Any) -> str:
-    """Return a value as it is typed after ``--set name=``."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def parse_assignments(items: list[str], option: str) -> dict[str, str]:
-    """Turn ``["a=1", "b=2"]`` into a dictionary of texts.
-
-    Raises:
-        UsageError: an item has no ``=`` or no name before it; ``option`` is named in the text.
-    """
-    result = {}
-    for item in items:
-        name, separator, value = item.partition("=")
-        if not separator or not name:
-            raise UsageError(f"{option} {item}: write it as {option} name=value")
-        result[name] = value
-    return result
+STAYS = {"volpathmis": f" stays: {VOLPATH} has no spectral MIS"}
 
 
 def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
@@ -158,9 +55,9 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
 
     Args:
         state: the scene as ``mi.parser.parse_file`` returns it, before any transformation.
-        wanted: ``None`` replaces as ``REPLACEMENTS`` says, and ``path``, which Mitsuba uses if the
-            scene names no integrator, like the others; ``"keep"`` replaces nothing; any other text
-            is the plugin to use for every integrator that nests no other.
+        wanted: ``None`` replaces as ``REPLACEMENTS`` says, a scene without an integrator as one
+            with ``path``; ``"keep"`` replaces nothing; any other text is the plugin to use for
+            every integrator that nests no other.
         settings: parameters to set on each of those integrators.
 
     Returns:
@@ -178,9 +75,12 @@ def choose(state, wanted: str | None, settings: dict[str, Any]) -> list[str]:
         for node in leaves:
             notes.extend(_replace(state, node.props, wanted))
     if settings and not leaves:
-        raise UsageError("--set: the scene has no integrator, choose one with --integrator NAME")
+        name = next(iter(settings))
+        raise UsageError(f"{called(name)}: the scene has no integrator, name one{by_name()}")
     for node in leaves:
         _apply(node.props, settings)
+        if node.props.get("max_depth") == 0:
+            notes.append("integrator: with max_depth=0 nothing is seen, its image is black")
     return notes
 
 
@@ -232,9 +132,9 @@ def _nests_integrator(node, state) -> bool:
 
 
 def _without_integrator(state, wanted: str | None) -> tuple[list, list[str]]:
-    """Handle a scene that names no integrator; Mitsuba would use ``path``."""
+    """Handle a scene that names no integrator as one that names ``path``."""
     if wanted == "keep":
-        return [], ["integrator: the scene names none, Mitsuba uses path"]
+        return [], []
     chosen = wanted or REPLACEMENTS["path"]
     node = mi.parser.SceneNode()
     node.type = mi.ObjectType.Integrator
@@ -242,7 +142,8 @@ def _without_integrator(state, wanted: str | None) -> tuple[list, list[str]]:
     state.nodes.append(node)
     index = len(state.nodes) - 1
     state.root.props["_arg_integrator"] = mi.Properties.ResolvedReference(index)
-    note = f"integrator: the scene names none, using {chosen}{_undo(wanted)}"
+    other = "" if wanted else by_name("NAME", " takes another")
+    note = f"integrator: the scene names none, using {chosen}{other}"
     return [state.nodes[index]], [note, *_about_media(state, "path", chosen)]
 
 
@@ -254,7 +155,9 @@ def _replace(state, props, wanted: str | None) -> list[str]:
     old = props.plugin_name()
     new = wanted or REPLACEMENTS.get(old, old)
     if old == new:
-        stays = STAYS.get(old, "") if wanted is None else ""
+        stays = (
+            f"{STAYS[old]}{by_name(VOLPATH, ' uses it')}" if wanted is None and old in STAYS else ""
+        )
         return [f"integrator: {old}{_listed(props)}{stays}"]
     notes = []
     if (old, new) == ("direct", DIRECT):
@@ -271,7 +174,13 @@ def _replace(state, props, wanted: str | None) -> list[str]:
 
 
 def _undo(wanted: str | None) -> str:
-    return " (--integrator keep undoes it)" if wanted is None else ""
+    return by_name("keep", " undoes it") if wanted is None else ""
+
+
+def by_name(name: str = "NAME", does: str = "") -> str:
+    """Return how the user chooses an integrator, and what that does, in brackets."""
+    how = typed(f'integrator="{name}"', f"--integrator {name}")
+    return f" ({how}{does})"
 
 
 def _means_the_same(parameter: str, old: str, new: str) -> bool:
@@ -295,7 +204,7 @@ def _translate_samples(props) -> list[str]:
         return []
     return [
         f"integrator: emitter_samples={emitter_samples} has no counterpart, "
-        "set shadow_rays and reservoirs with --set instead"
+        f"set shadow_rays and reservoirs{typed('', ' with --set')} instead"
     ]
 
 
@@ -319,14 +228,19 @@ def _apply(props, settings: dict[str, Any]) -> None:
             settings = {name: value for name, value in settings.items() if name != "aovs"}
         else:
             known = " or ".join(PARAMETERS)
-            raise UsageError(f"aovs: {plugin} shows no surfaces, {known} do (--integrator NAME)")
+            raise UsageError(
+                f"{argument('aovs')}: {plugin} shows no surfaces, {known} do{by_name()}"
+            )
     for name, value in settings.items():
         if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
             known = "; ".join(f"{key} ({what})" for key, what in PARAMETERS[plugin].items())
-            raise UsageError(f"--set {name}: {plugin} has no such parameter. It has: {known}")
+            raise UsageError(f"{called(name)}: {plugin} has no such parameter. It has: {known}")
         if name == light_groups.PARAMETER and plugin not in PARAMETERS:
-            raise UsageError(f"light groups: {plugin} has none, {' and '.join(PARAMETERS)} have")
-        props[name] = value
+            known = " and ".join(PARAMETERS)
+            raise UsageError(f"{argument(name)}: {plugin} has none, {known} have{by_name()}")
+        if plugin in PARAMETERS and name in PARAMETERS[plugin]:
+            check_type(name, value, PARAMETERS[plugin][name])
+        props[name] = with_wish(props.get(name, ""), value)
 
 
 def _listed(props) -> str:

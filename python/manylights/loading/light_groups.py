@@ -47,6 +47,14 @@ def of_integrator(integrator) -> str:
     return found[1] if found else ""
 
 
+def are_named(scene) -> bool:
+    """Has a light of a scene an id, or its shape? So it is, too, if there are no lights."""
+    emitters = scene.emitters()
+    shapes = (emitter.get_shape() for emitter in emitters)
+    ids = (emitter.id() or (shape and shape.id()) for emitter, shape in zip(emitters, shapes))
+    return not emitters or any(ids)
+
+
 def entry_of(groups: str, *names: str) -> int | None:
     """Return the number of the entry that a light with these names belongs to, None for none.
 

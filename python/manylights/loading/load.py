@@ -9,8 +9,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError
-from manylights.loading import integrators, light_groups, merging, samplers
+from manylights.errors import UsageError, check, shown
+from manylights.loading import integrators, light_groups, merging, ours, samplers
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
@@ -19,7 +19,7 @@ from manylights.loading.parsing import (
     parse_description,
     search_beside,
 )
-from manylights.threads import threads_for_files
+from manylights.threads import require_variant, threads_for_files
 
 
 @dataclass
@@ -64,7 +64,18 @@ def load(
         settings: parameters to set on the integrator. Default: none.
         usd_options: how a stage is read. Default: as ``UsdOptions()`` has it.
         sampler: ``None`` (``independent`` becomes ours), ``"keep"`` or a plugin's name.
+
+    Raises:
+        UsageError: (a ``ValueError``) no such file, or an argument that is something else.
+        RuntimeError: Mitsuba cannot read or make the scene.
     """
+    for name, value in (("integrator", integrator), ("sampler", sampler)):
+        check(name, value, value is None or isinstance(value, str), "the name of a plugin")
+    for name, value, kind, what in (
+        ("settings", settings, dict, "a dictionary"),
+        ("usd_options", usd_options, UsdOptions, "UsdOptions"),
+    ):
+        check(name, value, value is None or isinstance(value, kind), what)
     with search_beside(path), threads_for_files():
         groups = light_groups.as_text((settings or {}).get(light_groups.PARAMETER, ""))
         parsed = parse(path, defines, usd_options, groups)
@@ -81,6 +92,9 @@ def load_description(
     description: dict, integrator: str | None = None, settings: dict | None = None
 ) -> LoadedScene:
     """Do the same with a dictionary as for ``mi.load_dict``."""
+    kind = description.get("type")
+    if kind != "scene":
+        raise UsageError(f'scene: a dictionary of the type {shown(kind)}, must be "scene"')
     with threads_for_files():
         parsed = parse_description(description)
         return _choose_and_make(parsed, integrator, settings or {}, None)
@@ -100,14 +114,14 @@ def as_loaded(scene, integrator=None, added: dict | None = None) -> tuple[Loaded
     Raises:
         UsageError: either is something else, or there are parameters for what is made already.
     """
-    if not (integrator is None or isinstance(integrator, (str, dict, mi.Integrator))):
-        raise UsageError(
-            f"integrator {integrator!r}: must be a name, a dictionary or an mi.Integrator"
-        )
+    require_variant()
+    known = integrator is None or isinstance(integrator, (str, dict, mi.Integrator))
+    check("integrator", integrator, known, "a name, a dictionary or an mi.Integrator")
+    if isinstance(integrator, dict):
+        named = isinstance(integrator.get("type"), str)
+        check("integrator", integrator, named, 'a dictionary with the name of a plugin as "type"')
     made = isinstance(scene, (mi.Scene, LoadedScene))
-    strict = [
-        name for name, value in (added or {}).items() if not isinstance(value, integrators.Wish)
-    ]
+    strict = [name for name, value in (added or {}).items() if not isinstance(value, ours.Wish)]
     if strict and (made or isinstance(integrator, mi.Integrator)):
         what = "scene" if made else "integrator"
         raise UsageError(f"{strict[0]}: the {what} is made already, set the parameter before")
@@ -118,19 +132,22 @@ def as_loaded(scene, integrator=None, added: dict | None = None) -> tuple[Loaded
     own = integrator if isinstance(integrator, mi.Integrator) else None
     settings = dict(integrator) if isinstance(integrator, dict) else {}
     name = settings.pop("type", None) if settings else ("keep" if own else integrator)
-    settings |= {} if own else added or {}
+    settings = ours.joined(settings, {} if own else added or {})
     if isinstance(scene, dict):
         return load_description(scene, name, settings), own
     if isinstance(scene, (str, os.PathLike)):
         return load(os.fspath(scene), None, name, settings), own
-    raise UsageError(f"scene {scene!r}: must be a path, a dictionary or an mi.Scene")
+    what = f"a path, a dictionary or an mi.Scene of the variant {mi.variant()}"
+    raise UsageError(f"scene {shown(scene)}: must be {what}")
 
 
 def _integrator(wanted):
     """Return an integrator that was asked for, ``None`` for that of the scene."""
     if wanted is None or wanted == "keep" or isinstance(wanted, mi.Integrator):
         return None if wanted == "keep" else wanted
-    return mi.load_dict({"type": wanted} if isinstance(wanted, str) else wanted)
+    made = mi.load_dict({"type": wanted} if isinstance(wanted, str) else wanted)
+    check("integrator", wanted, isinstance(made, mi.Integrator), "an integrator of Mitsuba or ours")
+    return made
 
 
 def _choose_and_make(

@@ -12,6 +12,7 @@ sampling finds no light there: scenes with merged emitters are for ``manylights_
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,9 +20,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from manylights.errors import check
 from manylights.loading import light_groups, parsing
-from manylights.loading.integrators import PARAMETERS, leaf_integrators
+from manylights.loading.integrators import leaf_integrators
+from manylights.loading.ours import PARAMETERS
 from manylights.output import channels
+from manylights.threads import require_variant
 
 #: Parameters of shapes that say what the mesh is. Shapes with any other stay as they are.
 GEOMETRY = {
@@ -116,8 +120,13 @@ def merge_emitters(scene: dict, keep=()) -> MergedScene:
         of a mesh says how many they are: ``merged_3_emitters``.
 
     Raises:
-        ValueError: the scene's integrator is one of Mitsuba's: it would lose light.
+        ValueError: the scene's integrator is one of Mitsuba's: it would lose light. Or the scene is
+            not a dictionary, or ``keep`` not a list.
     """
+    require_variant()
+    check("scene", scene, isinstance(scene, dict), "a dictionary for mi.load_dict")
+    listed = isinstance(keep, Iterable) and not isinstance(keep, str)
+    check("keep", keep, listed, "a list of ids")
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_dict(config, scene)
     _check_integrators(state)

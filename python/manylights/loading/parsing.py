@@ -6,13 +6,15 @@ The ending of the file's name chooses the reader; after it XML and USD go the sa
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
-from manylights.errors import UsageError, one_line
+from manylights.errors import UsageError, argument, check, one_line, shown
+from manylights.files import path_of
 
 #: Endings of USD stages: whichever format, in text, binary, and packed.
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
@@ -81,9 +83,12 @@ def parse(
             ``defines`` for a stage or options of stages for XML.
         RuntimeError: Mitsuba cannot read it.
     """
+    path_of("path", path)
+    check("defines", defines, defines is None or isinstance(defines, dict), "a dictionary")
     if not Path(path).is_file():
-        what = "is a folder, not a scene" if Path(path).is_dir() else "no such file"
-        raise UsageError(f"{path}: {what}")
+        folder = path and Path(path).is_dir()
+        what = "is a folder, not a scene" if folder else "no such file"
+        raise UsageError(f"{path or shown(path)}: {what}")
     if Path(path).suffix.lower() in IMAGE_ENDINGS:
         raise UsageError(f"{path}: is an image, not a scene (an XML file or a USD stage)")
     if Path(path).suffix.lower() in USD_ENDINGS:
@@ -93,17 +98,25 @@ def parse(
     for known in fields(UsdOptions):
         given = getattr(usd_options, known.name, known.default)
         if given != known.default and known.name != "light_groups":
-            option = known.name.replace("_", "-")
-            raise UsageError(f"--{option}: {path} is XML, the option is for USD stages")
+            raise UsageError(f"{argument(known.name)}: {path} is XML, that is for USD stages")
     config = mi.parser.ParserConfig(mi.variant())
-    state = mi.parser.parse_file(config, str(path), **(defines or {}))
+    try:
+        state = mi.parser.parse_file(config, str(path), **(defines or {}))
+    except RuntimeError as error:
+        unused = re.findall(r"\$(\w+)=", str(error)) if "unused parameters" in str(error) else []
+        if not unused:
+            raise
+        names, defined = ", ".join(unused), argument("defines")
+        raise UsageError(f"{defined} {names}: {path} has no <default> of this name") from error
     mi.parser.transform_upgrade(config, state)
     return ParsedScene(config, state, files_of(state))
 
 
 def _parse_usd(path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
     if defines:
-        raise UsageError(f"-D {next(iter(defines))}: {path} is USD, only XML has <default>")
+        raise UsageError(
+            f"{argument('defines')} {next(iter(defines))}: {path} is USD, only XML has <default>"
+        )
     description = import_usd(path).load(path, **asdict(options))
     parsed = parse_description(description)
     # A stage composes layers that no node of the scene names.
@@ -204,6 +217,7 @@ class search_beside:
     """
 
     def __init__(self, path: str) -> None:
+        path_of("path", path)
         folders = (Path(os.path.abspath(path)).parent, Path(path).resolve().parent)
         self.folders = [str(folder) for folder in dict.fromkeys(folders)]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from manylights.errors import typed
+
 #: Ours: any number of samples, in any order, are those of one sequence for each pixel.
 SOBOL = "manylights_sobol"
 
@@ -38,7 +40,8 @@ def choose(state, wanted: str | None) -> list[str]:
             _add(state, index, new)
             replaced.append("independent")
     names = ", ".join(dict.fromkeys(replaced))
-    undo = " (--sampler keep undoes it)" if wanted is None else ""
+    keep = typed("an mi.Scene keeps its own", "--sampler keep undoes it")
+    undo = f" ({keep})" if wanted is None else ""
     return [f"sampler: {names} replaced by {new}{undo}"] if replaced else []
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
 
 #: Kernels of Dr.Jit 1.5 abort the process with an older LLVM on x86-64.
 OLDEST_LLVM = 17
@@ -30,15 +30,15 @@ def set_variant(name: str | None) -> str:
     Raises:
         UsageError: Mitsuba does not have it, or the machine lacks LLVM or CUDA.
     """
-    variant = name or default_variant()
+    variant, name = name or default_variant(), argument("variant")
     if variant not in mi.variants():
-        raise UsageError(f"--variant {variant}: unknown, choose from {', '.join(mi.variants())}")
+        raise UsageError(f"{name} {variant}: unknown, choose from {', '.join(mi.variants())}")
     needs = (
         ("llvm", dr.JitBackend.LLVM, f"LLVM {OLDEST_LLVM} or later (on Debian: libllvm19)"),
         ("cuda", dr.JitBackend.CUDA, "an NVIDIA driver and GPU"),
     )
     for prefix, backend, what in needs:
         if variant.startswith(prefix) and not has_backend(backend):
-            raise UsageError(f"--variant {variant}: needs {what}; a scalar variant does without")
+            raise UsageError(f"{name} {variant}: needs {what}; a scalar variant does without")
     mi.set_variant(variant)
     return variant

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError, one_line
+from manylights.errors import UsageError, argument, check, one_line
 from manylights.output import exr
 from manylights.threads import threads_for_files
 
@@ -79,23 +79,24 @@ def is_sum(name: str) -> bool:
     return re.match(rf"checkpoint\d*_({'|'.join(SUM_PARTS)})\.", name) is not None
 
 
-def aov_list(names: str | Sequence[str], option: str = "aovs") -> str:
+def aov_list(names: str | Sequence[str]) -> str:
     """Return the parameter ``aovs`` of our integrators for these names.
 
     Args:
         names: of ``AOVS``, or ``NAME:TYPE`` as the parameter has them; a text has commas between.
-        option: what they were given with, for messages.
 
     Raises:
         UsageError: an unknown name, or one that comes twice.
     """
-    words = names.split(",") if isinstance(names, str) else list(names)
+    listed = isinstance(names, (str, list, tuple))
+    check("aovs", names, listed, "a text with commas between names, or a list of them")
+    words = names.split(",") if isinstance(names, str) else names
     words = [str(word).strip() for word in words]
     for index, word in enumerate(words):
         if word not in AOVS and ":" not in word:
-            raise UsageError(f"{option} {word!r}: must be one of {', '.join(AOVS)}")
+            raise UsageError(f"{argument('aovs')} {word!r}: must be one of {', '.join(AOVS)}")
         if word in words[:index]:
-            raise UsageError(f"{option} {word!r}: comes twice")
+            raise UsageError(f"{argument('aovs')} {word!r}: comes twice")
     return ",".join(word if ":" in word else ":".join(AOVS[word]) for word in words)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from manylights.errors import UsageError, one_line
+from manylights.errors import UsageError, argument, one_line
 from manylights.output import channels
 
 #: What the denoiser wants to know of the surfaces in sight, as users name it.
@@ -19,7 +19,7 @@ EMISSION = "emission"
 #: How bright a channel is.
 LUMINANCE = np.array([0.212671, 0.715160, 0.072169], np.float32)
 
-MISSING = "denoise: needs the package mitsuba-oidn, type: pip install 'manylights[denoise]'"
+MISSING = "needs the package mitsuba-oidn, type: pip install 'manylights[denoise]'"
 
 
 def check_installed() -> None:
@@ -33,7 +33,8 @@ def check_installed() -> None:
     except ImportError as error:
         # It may be there, and lack something itself
         absent = getattr(error, "name", None) == "mitsuba_oidn"
-        raise UsageError(MISSING + ("" if absent else f" ({one_line(error)})")) from error
+        more = "" if absent else f" ({one_line(error)})"
+        raise UsageError(f"{argument('denoise')}: {MISSING}{more}") from error
 
 
 def with_guides(names: str | Sequence[str] | None) -> list[str]:
@@ -51,7 +52,7 @@ def picture_in(names: Sequence[str]) -> tuple[str, ...]:
     """
     found = channels.colors_in(names)
     if found is None or found == ("X", "Y", "Z"):
-        raise UsageError("denoise: the film has no colour channels (R, G, B or Y)")
+        raise UsageError(f"{argument('denoise')}: the film has no colour channels (R, G, B or Y)")
     return found
 
 

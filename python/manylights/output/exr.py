@@ -21,6 +21,9 @@ from manylights.errors import UsageError, one_line
 #: Prefix of our own attributes, which other programs show as they are.
 OURS = "manylights."
 
+#: The first bytes of each file of the format.
+MAGIC = b"\x76\x2f\x31\x01"
+
 #: Lines of a chunk, with ZIP.
 LINES = 16
 
@@ -130,6 +133,9 @@ def _opened(path: str | Path, **how):
     if not Path(path).is_file():
         raise UsageError(f"{path}: no such file")
     try:
+        with open(path, "rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise ValueError("it does not begin as one")
         # Otherwise rows that are missing are read as black
         if not OpenEXR.InputFile(str(path)).isComplete():
             raise ValueError("its end is missing")

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from manylights import files
-from manylights.errors import UsageError
+from manylights.errors import number
 from manylights.output import channels, exr, light_groups
 from manylights.threads import threads_for_files
 
@@ -31,8 +31,7 @@ def check_stops(value: float) -> None:
     Raises:
         UsageError: no number from -64 to 64.
     """
-    if not -64.0 <= value <= 64.0:
-        raise UsageError(f"exposure {value}: must be a number from -64 to 64")
+    number("exposure", value, lambda stops: -64.0 <= stops <= 64.0, "a number from -64 to 64")
 
 
 def write_images(

@@ -12,7 +12,7 @@ import numpy as np
 from manylights import files
 from manylights.errors import UsageError, one_line
 from manylights.progress import say
-from manylights.rendering import state_file
+from manylights.rendering import metadata, state_file
 from manylights.rendering.job import Job, differences
 from manylights.rendering.parts import Part, Run
 from manylights.rendering.state import State
@@ -103,7 +103,9 @@ class Checkpoint:
         name = processor()
         state.processors += [] if name in state.processors else [name]
         runs, shown = self._runs(state.history), self.job.driver.shown()
-        saved = Saved(self.path, self.facts, runs, state, shown, list(part.command))
+        facts = {**self.facts, "parameters": metadata.parameters(self.job.driver.integrator)}
+        standard = metadata.standard(self.job, self.facts["version"])
+        saved = Saved(self.path, facts, runs, state, shown, list(part.command), standard)
         state_file.write(saved)
 
     def _runs(self, history: History) -> list[Run]:

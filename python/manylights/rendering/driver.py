@@ -15,6 +15,7 @@ import numpy as np
 
 from manylights.errors import UsageError
 from manylights.loading import LoadedScene
+from manylights.loading.integrators import by_name
 from manylights.output import channels
 from manylights.rendering.plan import Limits, Step
 
@@ -42,6 +43,8 @@ class Driver:
     def __init__(self, loaded: LoadedScene, sensor, integrator=None) -> None:
         self.scene, self.sensor = loaded.scene, sensor
         self.integrator = integrator or self.scene.integrator()
+        if self.integrator is None:
+            raise UsageError(f"the scene has no integrator, name one{by_name()}")
         self.integrator_count = loaded.integrator_count
         self.indexed = sensor.sampler().class_name() in INDEXED
         self.plans = _has(self.integrator, PLAN)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from manylights.errors import argument, check, typed
 from manylights.loading import light_groups
-from manylights.loading.integrators import Wish
+from manylights.loading.ours import Wish
 from manylights.output import channels, images
 from manylights.output import denoise as denoising
 from manylights.rendering import live
-from manylights.rendering.job import Job, check
+from manylights.rendering.job import Job
 from manylights.rendering.state import State
 
 
@@ -60,22 +61,21 @@ class Extras:
                 raise TypeError(f"render() got an unexpected keyword argument {name!r}")
         extras = Extras(**arguments)
         images.check_stops(extras.exposure)
+        tev = extras.tev
+        check("tev", tev, tev is None or isinstance(tev, str), "a text, HOST:PORT")
         for name in ("denoise", "exposure"):
             value = getattr(extras, name)
             whole = not value or part is None
-            check(name, value, whole, "left out with part, and given to manylights.merge")
+            merge = typed("manylights.merge", "manylights merge")
+            check(name, value, whole, f"left out with {argument('part')}, and given to {merge}")
         if extras.denoise:
             denoising.check_installed()
         return extras
 
-    def parameters(self, option: str = "aovs") -> dict[str, str]:
-        """Return the parameters of our integrators for the channels that are wanted of them.
-
-        Args:
-            option: what ``aovs`` were given with, for messages.
-        """
+    def parameters(self) -> dict[str, str]:
+        """Return the parameters of our integrators for the channels that are wanted of them."""
         wanted = denoising.with_guides(self.aovs) if self.denoise else self.aovs
-        added = {} if wanted is None else {"aovs": channels.aov_list(wanted, option)}
+        added = {} if wanted is None else {"aovs": channels.aov_list(wanted)}
         if added and self.aovs is None:
             added["aovs"] = Wish(added["aovs"])
         if self.light_groups is not None:

@@ -13,7 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument, integer, number, typed
 from manylights.loading import LoadedScene, light_groups
 from manylights.output import images
 from manylights.rendering import plan as plans
@@ -27,7 +27,7 @@ FORMAT = 3
 
 #: Facts in files about what was rendered so far.
 STATE = ("history", "channels", "shown", "learnt", "sequences", "runs", "processors", "command")
-STATE += ("samples_done", "checksum", "seeds", "noise")
+STATE += ("samples_done", "checksum", "seeds", "samples", "seconds_taken", "parameters", "noise")
 
 #: Films that can be made anew from what a file says, to develop the sums of parts.
 FILMS = ("HDRFilm",)
@@ -87,11 +87,10 @@ class Job:
         sensors = loaded.scene.sensors()
         if not sensors:
             raise UsageError("the scene has no sensor")
-        check("sensor", sensor, 0 <= sensor < len(sensors), f"0 to {len(sensors) - 1}")
-        check("spp", spp, spp is None or 1 <= spp < 2**32, "1 to 4294967295")
-        check("seed", seed, 0 <= seed < 2**32, "0 to 4294967295")
-        for name, value in (("until_noise", noise), ("seconds", seconds)):
-            check(name, value, value is None or 0.0 < value < np.inf, "a number above 0")
+        sensor = integer("sensor", sensor, 0, len(sensors) - 1)
+        spp = None if spp is None else integer("spp", spp, 1, 2**32 - 1)
+        seed = integer("seed", seed, 0, 2**32 - 1)
+        noise, seconds = _target("until_noise", noise), _target("seconds", seconds)
         driver = Driver(loaded, sensors[sensor], integrator)
         _check_film(driver)
         _check_groups(driver)
@@ -222,26 +221,39 @@ def _check_film(driver: Driver) -> None:
 
 
 def _check_groups(driver: Driver) -> None:
-    """Raise ``UsageError`` if light groups are asked for and the film has no colours."""
+    """Raise ``UsageError`` if light groups are asked for and film or lights cannot have them."""
+    groups = light_groups.of_integrator(driver.integrator)
+    if not groups:
+        return
     film = driver.sensor.film()
     known = re.search(r"pixel_format = (\w+)", str(film))
     plain = film.class_name() in FILMS and known and known[1] in ("rgb", "rgba")
-    if light_groups.of_integrator(driver.integrator) and not plain:
+    if not plain:
         what = f"has pixel_format {known[1]}" if known else f"is a {film.class_name()}"
         todo = 'type <string name="pixel_format" value="rgb"/> in an hdrfilm'
         backend, mono, _ = mi.variant().partition("_mono")
         if mono:
             # Mitsuba's films have luminance there, whatever they are told
-            what, todo = f"has no colours in {mi.variant()}", f"--variant {backend}_rgb has them"
+            what, todo = (
+                f"has no colours in {mi.variant()}",
+                f"{typed('the variant', '--variant')} {backend}_rgb has them",
+            )
         raise UsageError(
-            f"light groups: the film {what}, layers need pixel_format rgb or rgba: {todo}"
+            f"{argument('light_groups')}: the film {what}, layers need pixel_format rgb or rgba: "
+            f"{todo}"
+        )
+    if light_groups.entry_of(groups, "") is None and not light_groups.are_named(driver.scene):
+        raise UsageError(
+            f"{argument('light_groups')} {groups}: no light of the scene has an id, nor has its "
+            'shape, give them some: <emitter type="point" id="lamp_1">'
         )
 
 
-def check(name: str, value, allowed: bool, what: str) -> None:
-    """Raise ``UsageError`` with name, value and what it must be, unless it is allowed."""
-    if not allowed:
-        raise UsageError(f"{name} {value}: must be {what}")
+def _target(name: str, value) -> float | None:
+    """Return a noise or a time that was asked for, None for none."""
+    if value is None:
+        return None
+    return number(name, value, lambda number: 0.0 < number < np.inf, "a number above 0")
 
 
 def _digests(paths: list[Path]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
 from manylights.output import channels
 from manylights.progress import say
 from manylights.rendering.develop import picture
@@ -11,7 +11,7 @@ from manylights.rendering.state import State
 #: Where tev listens if it is not told otherwise.
 HOST, PORT = "localhost", 14158
 
-MISSING = "tev: needs the package tevclient, type: pip install 'manylights[tev]'"
+MISSING = "needs the package tevclient, type: pip install 'manylights[tev]'"
 
 
 class Viewer:
@@ -41,7 +41,9 @@ class Viewer:
         except OSError as error:
             host, port = self.address
             reason = error.strerror or error
-            raise UsageError(f"tev {host}:{port}: nobody listens ({reason}), start tev") from error
+            raise UsageError(
+                f"{argument('tev')} {host}:{port}: nobody listens ({reason}), start tev"
+            ) from error
 
     def show(self, state: State, adjoint: bool, exposure: float) -> None:
         """Send the colours of what there is so far."""
@@ -68,7 +70,7 @@ class Viewer:
         try:
             from tevclient import Ipc
         except ImportError as error:
-            raise UsageError(MISSING) from error
+            raise UsageError(f"{argument('tev')}: {MISSING}") from error
         return Ipc(*self.address)
 
 
@@ -76,5 +78,7 @@ def _parse(address: str) -> tuple[str, int]:
     host, colon, port = address.rpartition(":") if ":" in address else (address, "", "")
     number = int(port) if port.isdigit() else PORT
     if colon and (not port.isdigit() or not 0 < number < 65536):
-        raise UsageError(f"tev {address}: must be HOST:PORT with a port from 1 to 65535")
+        raise UsageError(
+            f"{argument('tev')} {address}: must be HOST:PORT with a port from 1 to 65535"
+        )
     return host or HOST, number

@@ -14,7 +14,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights import files
+from manylights.errors import UsageError, check, typed
 from manylights.output import channels, images, light_groups
 from manylights.output import denoise as denoising
 from manylights.rendering import metadata, state_file
@@ -23,6 +24,7 @@ from manylights.rendering.job import FILMS, STATE, differences
 from manylights.rendering.parts import gaps, steps_of
 from manylights.rendering.state import State
 from manylights.rendering.state_file import Saved
+from manylights.threads import require_variant
 
 #: Formats of pixels by the channels of an image, those of the integrator left out.
 FORMATS = {
@@ -69,7 +71,8 @@ def merge(
     """Add parts of one render, in any order and grouping, or average renders of several seeds.
 
     All parts together give the bits of the render that was not parted. Of finished images the mean
-    is taken, in double precision, weighted by samples.
+    is taken, in double precision, weighted by samples. The file says what all of them say, of the
+    camera, too.
 
     Args:
         paths: files that ``render(..., part=...)``, a checkpoint or an earlier merging wrote, or
@@ -83,12 +86,16 @@ def merge(
     Raises:
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
             that comes twice, or one that is missing and ``partial`` is not set.
+        RuntimeError: no variant of Mitsuba is set.
     """
+    require_variant()
     target = None if output is None else images.check_output(str(output))
     images.check_stops(exposure)
     if denoise:
         denoising.check_installed()
-    paths = [Path(path) for path in paths]
+    listed = isinstance(paths, Iterable) and not isinstance(paths, (str, bytes))
+    check("paths", paths, listed, "a list of paths")
+    paths = [files.path_of("paths", path) for path in paths]
     if not paths:
         raise UsageError("nothing to merge: no files")
     first, bitmap = state_file.read(paths[0], WHAT, "")
@@ -166,7 +173,8 @@ class _Parts:
         missing = gaps(runs, self.steps)
         words = missing.words(self.steps)
         if missing and not partial:
-            raise UsageError(f"missing: {words}{self._remedy(missing)} (--partial does without)")
+            option = typed("partial=True", "--partial")
+            raise UsageError(f"missing: {words}{self._remedy(missing)} ({option} does without)")
         state, samples = self.state, self.state.history.spp
         if not samples:
             raise UsageError(f"{self.first.path}: no samples yet, missing: {words}")
@@ -176,14 +184,19 @@ class _Parts:
             return merged
         if missing:
             facts = {**self.facts, "part": MERGED}
-            saved = Saved(target, facts, runs, state, self.first.shown, self.first.command)
+            first, standard = self.first, self._standard()
+            saved = Saved(target, facts, runs, state, first.shown, first.command, standard)
             previews, notes = images.write_preview(bitmap, target, stops=stops)
             merged.files = [state_file.write(saved), *previews]
         else:
-            seeds = [self.facts["seed"]]
-            notes = _write(merged, target, {}, self.facts, seeds, denoise, stops)
+            told = self._standard() | _own(merged, self.facts, state.history.seconds)
+            facts = {**self.facts, "seeds": [self.facts["seed"]]}
+            notes = _write(merged, target, {}, facts, told, denoise, stops)
         merged.notes += notes
         return merged
+
+    def _standard(self) -> dict[str, Any]:
+        return metadata.shared(saved.standard for saved in self.files)
 
     def _remedy(self, missing) -> str:
         """Return how to render what is missing."""
@@ -224,10 +237,16 @@ def _developed(saved: Saved, state: State):
     return develop(film, state.total(facts["adjoint"]), facts["exposure"])[1]
 
 
-def _signature(facts: dict, seeds: list[int], samples: int) -> dict[str, str]:
+def _signature(facts: dict, samples: int) -> dict[str, str]:
     """Return what a finished render says of itself."""
     own = {name: facts[name] for name in facts if name not in STATE}
-    return state_file.signature({**own, "part": "1/1", "seeds": seeds}, samples)
+    return state_file.signature({**own, "part": "1/1", "seeds": facts["seeds"]}, samples)
+
+
+def _own(merged: Merged, facts: dict, seconds: float) -> dict[str, Any]:
+    """Return what it says beside facts; files of before may lack the integrator's parameters."""
+    told = metadata.own(merged.samples, seconds, facts.get("parameters", ""))
+    return {name: value for name, value in told.items() if value != ""}
 
 
 def _write(
@@ -235,11 +254,20 @@ def _write(
     target: Path,
     layers: dict,
     facts: dict,
-    seeds: list[int],
+    told: dict[str, Any],
     denoise: bool,
     stops: float,
 ) -> list[str]:
-    """Write the image of finished parts or images; return notes about that."""
+    """Write the image of finished parts or images; return notes about that.
+
+    Args:
+        merged: the image.
+        target: of the file.
+        layers: further channels.
+        facts: of the job, with the ``seeds``.
+        told: other attributes of the file.
+        denoise, stops: arguments of :func:`merge`.
+    """
     names, shown = channels.names(merged.bitmap), None
     if denoise:
         pixels = np.array(merged.bitmap, copy=False).reshape(*merged.bitmap.size()[::-1], -1)
@@ -249,7 +277,7 @@ def _write(
         pixels = np.concatenate(planes, axis=2)
         shown = denoising.denoised(pixels, [*names, *guides], float(facts["exposure"]))
         layers = layers | channels.color_layers(channels.DENOISED, shown)
-    own = _signature(facts, seeds, merged.samples)
+    own = _signature(facts, merged.samples) | told
     number = np.float16 if facts["number"] == "float16" else np.float32
     merged.files, notes = images.write_images(
         merged.bitmap, target, layers, own, number, merged.samples, shown, stops
@@ -267,6 +295,7 @@ def _merge_images(
 ) -> Merged:
     """Return the mean of finished images."""
     facts, owners = first.facts, dict.fromkeys(first.facts["seeds"], first.path)
+    standards, seconds = [first.standard], facts.get("seconds_taken", 0.0)
     names = [name for name in planes if channels.is_averaged(name)]
     # The variance of a mean: weights are squared
     powers = {name: 2 if name.startswith(channels.VARIANCE) else 1 for name in names}
@@ -277,6 +306,8 @@ def _merge_images(
             saved, planes = state_file.read(path, WHAT, "")
             found = [name for name in planes if channels.is_averaged(name)]
             _check_image(saved, found, first, names, owners)
+            standards.append(saved.standard)
+            seconds += saved.facts.get("seconds_taken", 0.0)
         weight = saved.facts["samples_done"]
         for name in names:
             total[name] += planes[name].astype(np.float64) * float(weight) ** powers[name]
@@ -292,7 +323,9 @@ def _merge_images(
     text = f"images: the mean of {count}, weighted by samples; their sums are not in the files"
     merged = Merged(bitmap, samples, "", [text])
     if target is not None:
-        merged.notes += _write(merged, target, layers, facts, sorted(owners), denoise, stops)
+        told = metadata.shared(standards) | _own(merged, facts, seconds)
+        facts = {**facts, "seeds": sorted(owners)}
+        merged.notes += _write(merged, target, layers, facts, told, denoise, stops)
     return merged
 
 
@@ -304,7 +337,7 @@ def _check_image(saved: Saved, names, first: Saved, expected, owners: dict[int, 
             "render first, then the images"
         )
     changes = differences(
-        saved.facts, first.facts, but=("part", "seed", "spp", "step_count", "steps", *metadata.OWN)
+        saved.facts, first.facts, but=("part", "seed", "spp", "step_count", "steps")
     )
     if changes:
         text = "; ".join(changes)

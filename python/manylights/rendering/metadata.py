@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Iterable
 from typing import Any
 
 import mitsuba as mi
@@ -14,8 +15,8 @@ from manylights.output import exr
 #: Primaries and white of what Mitsuba calls RGB: those of ITU-R BT.709.
 CHROMATICITIES = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 
-#: What :func:`attributes` adds to the facts of a job.
-OWN = ("samples", "seconds_taken", "parameters", "noise")
+#: Attributes of the OpenEXR standard that say how an image was made.
+STANDARD = ("software", "chromaticities", "worldToCamera", "worldToNDC")
 
 #: Facts of parts and checkpoints that are for the program alone.
 HIDDEN = ("learnt", "channels", "shown", "runs")
@@ -35,22 +36,34 @@ def attributes(job, result, software: str) -> dict[str, Any]:
         result: its ``RenderResult``.
         software: the versions, as the facts of the job have them.
     """
-    own = {
-        "samples": result.samples,
-        "seconds_taken": round(result.seconds, 3),
-        "parameters": _parameters(job.driver.integrator),
-    }
-    if result.noise is not None:
-        own["noise"] = result.noise
+    noise = {} if result.noise is None else {f"{exr.OURS}noise": result.noise}
+    told = own(result.samples, result.seconds, parameters(job.driver.integrator))
+    return standard(job, software) | told | noise
+
+
+def standard(job, software: str) -> dict[str, Any]:
+    """Return those of the OpenEXR standard, which parts and checkpoints have, too."""
+    camera = camera_matrices(job.driver.sensor)
+    return {"software": software, "chromaticities": CHROMATICITIES, **camera}
+
+
+def own(samples: int, seconds: float, parameters: str) -> dict[str, Any]:
+    """Return those of ours that are not facts of the job: what it took, and by which integrator."""
+    told = {"samples": samples, "seconds_taken": round(seconds, 3), "parameters": parameters}
+    return {exr.OURS + name: value for name, value in told.items()}
+
+
+def shared(files: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Return the attributes that are the same in all of some files."""
+    first, *others = files
     return {
-        "software": software,
-        "chromaticities": CHROMATICITIES,
-        **camera_matrices(job.driver.sensor),
-        **{exr.OURS + name: value for name, value in own.items()},
+        name: value
+        for name, value in first.items()
+        if all(name in other and np.array_equal(value, other[name]) for other in others)
     }
 
 
-def _parameters(integrator) -> str:
+def parameters(integrator) -> str:
     """Return an integrator with its parameters as Mitsuba prints it, without what was measured."""
     return re.sub(r",\n *tree = .*", "", str(integrator))
 

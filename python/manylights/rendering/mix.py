@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 from typing import Union
 
 import numpy as np
 
-from manylights.errors import UsageError
-from manylights.output import channels, exr, images, light_groups
+from manylights import files
+from manylights.errors import UsageError, argument, check
+from manylights.output import channels, denoise, exr, images, light_groups
+from manylights.threads import require_variant
 
-#: What is true of the image as it was rendered alone.
-OF_THE_RENDER = (channels.VARIANCE, channels.DENOISED)
+#: What is true of the image as it was rendered alone. Which group a lamp in sight is of, whose
+#: emission a layer has, is not in the file.
+OF_THE_RENDER = (channels.VARIANCE, channels.DENOISED, f"{denoise.EMISSION}.")
 
 #: Facts about it that are not those of a mix.
 OWN_FACTS = ("noise",)
@@ -46,7 +50,8 @@ def mix(
 
     All in single precision: each layer is a product, the image the sum of the layers in the order
     of their channels' names. Groups without a weight stay as they are; of a mix another mix can be
-    made.
+    made. Layers of surfaces and attributes of the file are kept; what is that of the render alone
+    (``variance``, ``emission``, ``denoised``) is left out.
 
     Args:
         path: an image that ``render(..., light_groups=...)`` or ``manylights render`` wrote.
@@ -56,12 +61,17 @@ def mix(
 
     Raises:
         UsageError: (a ``ValueError``) no render of ours, no such group, a wrong weight.
+        RuntimeError: there is an output, and no variant of Mitsuba is set.
     """
     target = None if output is None else images.check_output(str(output))
+    if target is not None:
+        require_variant()
     images.check_stops(exposure)
+    path = files.path_of("path", path)
+    check("weights", weights, isinstance(weights, Mapping), "a dictionary of factors by group")
     planes, attributes = exr.read(path)
     groups = light_groups.groups(planes)
-    _check_file(Path(path), groups, attributes)
+    _check_file(path, groups, attributes)
     factors = {name: _factors(name, weight) for name, weight in weights.items()}
     for name in factors:
         if name not in groups:
@@ -89,15 +99,16 @@ def _check_file(path: Path, groups: list[str], attributes: dict) -> None:
     if f"{exr.OURS}channels" in attributes:
         raise UsageError(f"{path}: a part or checkpoint, merge all parts of the render first")
     if not groups:
-        raise UsageError(f"{path}: no light groups, render it with --light-groups")
+        raise UsageError(f"{path}: no light groups, render it with {argument('light_groups')}")
 
 
 def _factors(name: str, weight: Weight) -> list[np.float32]:
     """Return a weight as three numbers in single precision."""
+    weight = weight.tolist() if isinstance(weight, np.ndarray) else weight
     numbers = list(weight) if isinstance(weight, Sequence) else [weight] * 3
     largest = float(np.finfo(np.float32).max)
-    wrong = len(numbers) != 3 or isinstance(weight, str)
-    if wrong or not all(0.0 <= number <= largest for number in numbers):
+    real = len(numbers) == 3 and all(isinstance(number, Real) for number in numbers)
+    if not real or not all(0.0 <= number <= largest for number in numbers):
         raise UsageError(f"{name}={weight}: must be one or three finite numbers of at least 0")
     return [np.float32(number) for number in numbers]
 

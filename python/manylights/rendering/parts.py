@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import check, is_integer
 
 #: Digits of the numbers in the names of files, at least: sorted by name they are in their order.
 DIGITS = 2
@@ -43,10 +43,11 @@ class Part:
         """
         if value is None or isinstance(value, Part):
             return value
-        whole = isinstance(value, (tuple, list)) and all(type(item) is int for item in value)
-        if not whole or len(value) != 2 or not 1 <= value[0] <= value[1] <= MOST_PARTS:
-            raise UsageError(f"part {value}: must be two integers, (3, 16) is the third of 16")
-        return Part(*value)
+        pair = isinstance(value, (tuple, list)) and len(value) == 2 and all(map(is_integer, value))
+        fits = pair and 1 <= value[0] <= value[1] <= MOST_PARTS
+        what = f"two integers, 1 <= K <= N <= {MOST_PARTS}, (3, 16) is the third of 16"
+        check("part", value, fits, what)
+        return Part(*map(int, value))
 
     def step(self, done: int) -> int:
         """Return the index of the step after so many of this part."""

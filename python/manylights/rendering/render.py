@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from manylights import loading
-from manylights.errors import UsageError
+from manylights import files, loading
+from manylights.errors import UsageError, argument, check, integer, number
 from manylights.output import channels, images
 from manylights.rendering import checkpoint as checkpoints
 from manylights.rendering import metadata, state_file
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
 from manylights.rendering.extras import Extras
-from manylights.rendering.job import Job, check
+from manylights.rendering.job import Job
 from manylights.rendering.parts import Part
 from manylights.rendering.state import State
-from manylights.threads import thread_count
+from manylights.threads import MOST_THREADS, thread_count
 
 
 @dataclass
@@ -144,18 +144,21 @@ def render(
 
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
     """Return the facts that files need, and the state that the render goes on from."""
-    check("learnt", learnt, learnt is None or job.part is not None, "given with part")
+    check(
+        "learnt", learnt, learnt is None or job.part is not None, f"given with {argument('part')}"
+    )
     # Before the render, which may change the scene's parameters.
     facts = store.facts if store else job.facts() if target or learnt else {}
     state = (store and store.restore()) or State.empty(job.course.sequences)
     if learnt is not None and not state.learnt.size:
-        state.learnt = checkpoints.learnt(Path(learnt), job, facts)
+        state.learnt = checkpoints.learnt(files.path_of("learnt", learnt), job, facts)
     return facts, state
 
 
 def _work(job: Job, state: State, store, facts, progress, watch, threads, client, ship) -> None:
     """Render what the state does not have, here or with workers."""
-    check("threads", threads, threads is None or threads >= 1, "1 or more")
+    check("progress", progress, callable(progress), "a function")
+    threads = None if threads is None else integer("threads", threads, 1, MOST_THREADS)
     check("ship", ship, not ship or client is not None, "given with client")
     if client is None:
         with thread_count(threads):
@@ -217,8 +220,8 @@ def variance_layers(result: RenderResult) -> dict[str, np.ndarray]:
 
 
 def _store(path: str | Path, job: Job, seconds: float) -> Checkpoint:
-    check("checkpoint_seconds", seconds, seconds > 0.0, "above 0")
-    path = Path(path)
+    seconds = number("checkpoint_seconds", seconds, lambda value: value > 0.0, "a number above 0")
+    path = files.path_of("checkpoint", path)
     if path.suffix.lower() != ".exr":
         raise UsageError(f"checkpoint {path}: it is an OpenEXR file, end the name in .exr")
     if not path.parent.is_dir():

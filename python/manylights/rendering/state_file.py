@@ -14,7 +14,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 
 from manylights.errors import UsageError, one_line
 from manylights.output import channels, exr
+from manylights.rendering import metadata
 from manylights.rendering.develop import WEIGHT, picture
 from manylights.rendering.job import FORMAT
 from manylights.rendering.parts import Part, Run
@@ -47,6 +48,7 @@ class Saved:
         state: ``None`` in a finished image.
         shown: names of the channels of the image.
         command: words of the command line that rendered it, without the part; empty if none did.
+        standard: attributes that are those of the OpenEXR standard (``metadata.STANDARD``).
     """
 
     path: Path
@@ -55,6 +57,7 @@ class Saved:
     state: State | None
     shown: list[str]
     command: list[str]
+    standard: dict[str, Any] = field(default_factory=dict)
 
 
 def write(saved: Saved) -> Path:
@@ -72,7 +75,7 @@ def write(saved: Saved) -> Path:
     done |= {"processors": state.processors, "command": saved.command}
     facts = {**facts, **done, "samples_done": state.history.spp}
     facts["checksum"] = _checksum(facts, state.sums)
-    return exr.write(saved.path, planes, signature(facts, state.history.spp))
+    return exr.write(saved.path, planes, saved.standard | signature(facts, state.history.spp))
 
 
 def signature(facts: dict[str, Any], samples: int) -> dict[str, str]:
@@ -92,6 +95,8 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, dict[str, np.ndar
     Raises:
         UsageError: not such a file, or not a whole one.
     """
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
     try:
         planes, attributes = exr.read(path)
         facts = {
@@ -100,10 +105,14 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, dict[str, np.ndar
             if name.startswith(exr.OURS)
         }
         if "samples_done" in facts:
-            return _saved(path, planes, facts), planes
+            saved = _saved(path, planes, facts)
+            named = (name for name in metadata.STANDARD if name in attributes)
+            saved.standard = {name: attributes[name] for name in named}
+            return saved, planes
     except (UsageError, ValueError, KeyError, TypeError, AttributeError, zlib.error) as error:
         what = f"{type(error).__name__}: " if isinstance(error, (KeyError, TypeError)) else ""
-        text = f"{path}: not a whole {prefix}{remedy} ({what}{one_line(error)})"
+        reason = one_line(error).removeprefix(f"{path}: ")
+        text = f"{path}: not a whole {prefix}{remedy} ({what}{reason})"
         raise UsageError(text) from error
     raise UsageError(f"{path}: not a {prefix} of manylights{remedy}")
 

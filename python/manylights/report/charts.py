@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from manylights.bench.methods import ABOUT, SWEPT
 from manylights.bench.records import Point, Results, Scene, Series
-from manylights.loading.integrators import value_text
+from manylights.loading.ours import value_text
 from manylights.report import grouping
 from manylights.report.statistics import (
     CLEARLY_ABOVE,

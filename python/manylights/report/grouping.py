@@ -7,7 +7,7 @@ from typing import Any
 
 from manylights.bench.methods import SWEPT
 from manylights.bench.records import Results, Scene, Series
-from manylights.loading.integrators import value_text
+from manylights.loading.ours import value_text
 from manylights.report.statistics import cost, gain
 
 #: A sweep with fewer values is no curve.

@@ -19,7 +19,7 @@ def coincident(
         options: ``integrator`` and ``seed``, as for every generator.
     """
     n_lights = build.check_count(n_lights)
-    rng = np.random.default_rng(options.pop("seed", 0))
+    rng = build.random(options.pop("seed", 0))
     weight = build.log_uniform(rng, n_lights, 1.0, 2.0)
     lights = [
         build.point([0.5, 0.3, 2.0], value)
@@ -42,7 +42,7 @@ def bright_far(
         options: ``integrator`` and ``seed``, as for every generator.
     """
     n_lights = build.check_count(n_lights, least=2)
-    rng = np.random.default_rng(options.pop("seed", 0))
+    rng = build.random(options.pop("seed", 0))
     near = n_lights - 1
     position = rng.uniform([-4.0, -3.0, 0.8], [4.0, 4.0, 2.5], (near, 3))
     lights = [build.point(place, 12.0 / near * np.array(build.WARM)) for place in position]
@@ -65,7 +65,7 @@ def behind_wall(
         options: ``integrator`` and ``seed``, as for every generator.
     """
     n_lights = build.check_count(n_lights)
-    rng = np.random.default_rng(options.pop("seed", 0))
+    rng = build.random(options.pop("seed", 0))
     seen = max(n_lights // 100, 1)
     front = rng.uniform([-3.0, -2.0, 1.5], [3.0, 2.0, 3.0], (seen, 3))
     back = rng.uniform([-4.0, 3.3, 0.3], [4.0, 5.0, 3.5], (n_lights - seen, 3))
@@ -95,9 +95,9 @@ def narrow_spots(
         options: ``integrator`` and ``seed``, as for every generator.
     """
     n_lights = build.check_count(n_lights)
-    if not 0.0 < cutoff < 90.0:
-        raise ValueError(f"cutoff={cutoff}: must be above 0 and below 90")
-    rng = np.random.default_rng(options.pop("seed", 0))
+    allowed = build.is_real(cutoff) and 0.0 < cutoff < 90.0
+    build.check("cutoff", cutoff, allowed, "above 0 and below 90")
+    rng = build.random(options.pop("seed", 0))
     position = rng.uniform([-5.0, -4.0, 3.5], [5.0, 6.0, 4.5], (n_lights, 3))
     direction = rng.normal(0.0, 0.15, (n_lights, 3)) - np.array([0.0, 0.0, 1.0])
     covered = n_lights * (np.tan(np.radians(cutoff)) * 4.0) ** 2 * np.pi / 100.0
@@ -144,7 +144,7 @@ def twelve_decades(
         options: ``integrator`` and ``seed``, as for every generator.
     """
     n_lights = build.check_count(n_lights)
-    rng = np.random.default_rng(options.pop("seed", 0))
+    rng = build.random(options.pop("seed", 0))
     position = rng.uniform([-4.0, -3.0, 0.4], [4.0, 4.0, 3.0], (n_lights, 3))
     decade = -12.0 * (np.arange(n_lights) / max(n_lights - 1, 1))
     intensity = 10.0 ** rng.permutation(decade)[:, None] * np.array(build.WHITE)
@@ -176,7 +176,7 @@ def cut_boundary(
         integrator: name of a plugin, or its dictionary.
     """
     n_lights = build.check_count(n_lights)
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     cluster = np.arange(n_lights) % 3
     position = rng.uniform([-0.8, -0.8, 0.8], [0.8, 0.8, 1.6], (n_lights, 3))
     position[:, 0] += np.array([-5.0, 0.0, 5.0])[cluster]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +17,9 @@ WARM = (1.0, 0.68, 0.36)
 COOL = (0.72, 0.86, 1.0)
 WHITE = (1.0, 0.93, 0.82)
 NEON = ((1.0, 0.08, 0.45), (0.1, 0.9, 1.0), (0.45, 1.0, 0.2), (1.0, 0.45, 0.05), (0.5, 0.2, 1.0))
+
+#: Of a scene.
+MOST_LIGHTS = 1_000_000
 
 
 @dataclass
@@ -60,9 +64,33 @@ def require_variant() -> None:
 
 def check_count(n_lights: int, least: int = 1) -> int:
     """Return ``n_lights``; raise ValueError unless it is an integer in ``least`` to 1,000,000."""
-    if int(n_lights) != n_lights or not least <= n_lights <= 1_000_000:
-        raise ValueError(f"n_lights={n_lights}: must be an integer from {least} to 1,000,000")
+    check_integer("n_lights", n_lights, least, MOST_LIGHTS)
     return int(n_lights)
+
+
+def check_integer(name: str, value, least: int, most: int | None = None) -> None:
+    """Raise ValueError unless an argument is an integer in a range; 10.0 is one."""
+    words = f"of at least {least}" if most is None else f"from {least} to {most:,}"
+    limit = np.inf if most is None else most
+    allowed = is_real(value) and least <= value <= limit and value < np.inf
+    check(name, value, allowed and int(value) == value, f"an integer {words}")
+
+
+def check(name: str, value, allowed: bool, what: str) -> None:
+    """Raise ValueError with argument, value and what it must be, unless it is allowed."""
+    if not allowed:
+        raise ValueError(f"{name}={value!r}: must be {what}")
+
+
+def is_real(value) -> bool:
+    """Is it a real number, of Python or NumPy?"""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def random(seed: int) -> np.random.Generator:
+    """Return a generator of random numbers; raise ValueError unless the seed is one."""
+    check_integer("seed", seed, 0)
+    return np.random.default_rng(int(seed))
 
 
 def log_uniform(rng: np.random.Generator, count: int, median: float, decades: float) -> np.ndarray:
@@ -79,6 +107,8 @@ def scene(
     integrator: str | Mapping, sensor: dict, parts: Mapping[str, object] | None = None
 ) -> dict:
     """Return the dictionary of a scene; ``integrator`` is a plugin's name or a dictionary."""
+    known = isinstance(integrator, (str, Mapping))
+    check("integrator", integrator, known, "the name of a plugin or a dictionary")
     if isinstance(integrator, str):
         integrator = {"type": integrator}
     return {"type": "scene", "integrator": dict(integrator), "sensor": sensor, **(parts or {})}
@@ -88,6 +118,8 @@ def camera(
     origin, target, *, width: int, height: int, spp: int, fov: float = 50.0, up=(0, 0, 1)
 ) -> dict:
     """Return a perspective camera with a box filter; ``fov`` is the horizontal angle in degrees."""
+    for name, value in (("width", width), ("height", height), ("spp", spp)):
+        check_integer(name, value, 1)
     return {
         "type": "perspective",
         "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=up),

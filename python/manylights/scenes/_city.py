@@ -61,7 +61,7 @@ def city(
     n_lights = build.check_count(n_lights)
     if kind not in KINDS:
         raise ValueError(f"kind={kind!r}: choose from {', '.join(KINDS)}")
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     wanted = _quads_for(n_lights, kind)
     layout = layout_for(rng, wanted)
     groups, dark = lights(rng, layout, wanted)

@@ -54,7 +54,7 @@ def fog_open(
     if kind not in ("points", "mesh"):
         raise ValueError(f"kind={kind!r}: choose from points, mesh")
     build.require_variant()
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     count = n_lights if kind == "points" else (n_lights + 1) // 2
     row = rng.integers(len(ROWS), size=count)
     position = rng.uniform([-0.5, 0.0, 0.4], [0.5, DEPTH, 2.2], (count, 3))
@@ -129,10 +129,9 @@ def fog_rooms(
 
 def _in_fog(description: dict, low, high, mean_free_path: float, g: float) -> dict:
     """Return the scene with a box of fog, given by two corners, around the camera."""
-    if not mean_free_path > 0.0:
-        raise ValueError(f"mean_free_path={mean_free_path}: must be above 0")
-    if not -1.0 < g < 1.0:
-        raise ValueError(f"g={g}: must be above -1 and below 1")
+    allowed = build.is_real(mean_free_path) and mean_free_path > 0.0
+    build.check("mean_free_path", mean_free_path, allowed, "above 0")
+    build.check("g", g, build.is_real(g) and -1.0 < g < 1.0, "above -1 and below 1")
     low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     center, half = 0.5 * (low + high), 0.5 * (high - low)
     fog = {"type": "ref", "id": "fog"}

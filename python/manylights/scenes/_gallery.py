@@ -37,7 +37,7 @@ def bulbs(
     if kind not in ("points", "spheres"):
         raise ValueError(f"kind={kind!r}: choose from points, spheres")
     build.require_variant()
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     position = _strings(rng, n_lights)
     weight = build.log_uniform(rng, n_lights, 1.0, 2.0)
     colors = build.pick(rng, (build.WARM, build.WARM, build.WHITE, *build.NEON), n_lights)
@@ -78,7 +78,7 @@ def open_plane(
         integrator: name of a plugin, or its dictionary.
     """
     n_lights = build.check_count(n_lights)
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     position = np.concatenate(
         [rng.uniform(-20.0, 20.0, (n_lights, 2)), rng.uniform(0.3, 1.5, (n_lights, 1))], axis=1
     )
@@ -121,10 +121,9 @@ def rooms(
             sampling handles that one only. Default: False.
     """
     n_lights = build.check_count(n_lights)
-    if per_room < 1:
-        raise ValueError(f"per_room={per_room}: must be at least 1")
+    build.check_integer("per_room", per_room, 1)
     build.require_variant()
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     count = (n_lights + 1) // 2
     side = int(np.ceil(np.sqrt(-(-count // per_room))))
     low, high = _walls(side)
@@ -176,10 +175,10 @@ def glossy(
             sampling handles that one only. Default: False.
     """
     n_lights = build.check_count(n_lights)
-    if not 0.0 < roughness <= 1.0:
-        raise ValueError(f"roughness={roughness}: must be above 0 and at most 1")
+    allowed = build.is_real(roughness) and 0.0 < roughness <= 1.0
+    build.check("roughness", roughness, allowed, "above 0 and at most 1")
     build.require_variant()
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     count = (n_lights + 1) // 2
     center = rng.uniform([-9.0, -7.0, 5.0], [9.0, 12.0, 6.5], (count, 3))
     edge = np.sqrt(30.0 / count) * rng.uniform(0.15, 0.3, count)[:, None]

@@ -38,7 +38,7 @@ def house(
     """
     n_lights = build.check_count(n_lights)
     build.require_variant()
-    rng = np.random.default_rng(seed)
+    rng = build.random(seed)
     low, high = np.array(_slabs() + _walls() + _furniture(rng)).swapaxes(0, 1)
     parts = {
         "rooms": build.boxes("rooms", low, high, rng.uniform(0.4, 0.7, (len(low), 3))),

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
+from manylights.errors import argument
 from manylights.usd.context import Context
 from manylights.usd.settings import RenderSettings
 from manylights.usd.stage import StageError
@@ -56,15 +57,16 @@ def _cameras(stage: Usd.Stage) -> list[Usd.Prim]:
 
 def _named(stage: Usd.Stage, path: str, cameras: list[Usd.Prim]) -> Usd.Prim:
     known = ", ".join(str(prim.GetPath()) for prim in cameras[:10]) or "none"
+    name = argument("camera")
     if not Sdf.Path.IsValidPathString(str(path)):
-        raise StageError(f"camera {path}: not a path; the stage has {known}")
+        raise StageError(f"{name} {path}: not a path; the stage has {known}")
     path = Sdf.Path(str(path)).MakeAbsolutePath(Sdf.Path.absoluteRootPath)
     prim = stage.GetPrimAtPath(path)
     if not prim:
-        raise StageError(f"camera {path}: no such prim; the stage has {known}")
+        raise StageError(f"{name} {path}: no such prim; the stage has {known}")
     if not prim.IsA(UsdGeom.Camera):
         kind = prim.GetTypeName() or "without type"
-        raise StageError(f"camera {path}: a prim {kind}, no Camera; the stage has {known}")
+        raise StageError(f"{name} {path}: a prim {kind}, no Camera; the stage has {known}")
     return prim
 
 

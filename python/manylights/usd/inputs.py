@@ -7,6 +7,7 @@ import math
 import numpy as np
 from pxr import Sdf, Usd, UsdLux, UsdShade
 
+from manylights.errors import typed
 from manylights.usd.context import Context
 
 #: What inputs are where a stage says nothing, or blocks them.
@@ -76,7 +77,7 @@ class LightInputs:
         elif names:
             text = (
                 f"{', '.join(sorted(names))} without inputs: are of lights before USD 21.05 and "
-                "were ignored; legacy_lights=True reads them"
+                f"were ignored; {typed('legacy_lights=True', '--legacy-lights')} reads them"
             )
             self.context.notes.add("legacy_lights", text, self.prim)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Sdf, Usd
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
 from manylights.loading.light_groups import entry_of
 
 #: Paths that an error lists.
@@ -79,9 +79,9 @@ class LightGroups:
         for index, (group, _, pattern) in enumerate(entries):
             if index not in self._used:
                 raise UsageError(
-                    f'light_groups: "{group}={pattern}" matches no light that an entry before it '
-                    "has not. Patterns are for the paths of prims (* fits / too) or their names. "
-                    f"The stage has {self._listed()}"
+                    f'{argument("light_groups")}: "{group}={pattern}" matches no light that an '
+                    "entry before it has not. Patterns are for the paths of prims (* fits / too) "
+                    f"or their names. The stage has {self._listed()}"
                 )
 
     def check_environment(self, members: Iterable[GroupMember | None]) -> None:
@@ -93,8 +93,8 @@ class LightGroups:
         if len(found) > 1:
             listed = " and ".join(f"{path} in {name}" for name, path in found.items())
             raise UsageError(
-                f"light_groups: {listed}: the domes of a stage become one environment, which one "
-                "entry has to fit"
+                f"{argument('light_groups')}: {listed}: the domes of a stage become one "
+                "environment, which one entry has to fit"
             )
 
     def _listed(self) -> str:

@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from manylights.errors import one_line
-from manylights.loading.integrators import PARAMETERS, REPLACEMENTS, VOLPATH
+from manylights.errors import check, integer, one_line, typed
+from manylights.files import path_of
+from manylights.loading.integrators import REPLACEMENTS
 from manylights.loading.light_groups import PARAMETER, as_text
+from manylights.loading.ours import PARAMETERS, VOLPATH
 from manylights.loading.parsing import MOST_SUBDIVISION, UsdOptions
+from manylights.threads import require_variant
 from manylights.usd import cameras, skinning
 from manylights.usd.context import Context, Notes
 from manylights.usd.description import instantiate
@@ -110,10 +113,12 @@ def describe(path, **choices) -> SceneDict:
         path: of the stage.
         choices: the other arguments of :func:`load`.
     """
+    require_variant()
+    path_of("path", path)
     options = UsdOptions(**choices)
     levels = options.subdivision
-    if levels is not None and not 0 <= levels <= MOST_SUBDIVISION:
-        raise StageError(f"subdivision {levels}: 0 to {MOST_SUBDIVISION} levels are possible")
+    if levels is not None:
+        levels = integer("subdivision", levels, 0, MOST_SUBDIVISION)
     notes, purposes = Notes(), _purposes(options.purposes)
     with guarded(path):
         stage = open_stage(path, notes)
@@ -133,11 +138,13 @@ def describe(path, **choices) -> SceneDict:
 
 
 def _purposes(purposes) -> tuple[str, ...]:
-    purposes = (purposes,) if isinstance(purposes, str) else tuple(purposes)
+    purposes = (purposes,) if isinstance(purposes, str) else purposes
+    listed = isinstance(purposes, (list, tuple, set, frozenset))
+    check("purposes", purposes, listed, f"a list of {', '.join(PURPOSES)}")
     for purpose in purposes:
         if purpose not in PURPOSES:
             raise StageError(f"purpose {purpose!r}: it has to be one of {', '.join(PURPOSES)}")
-    return purposes
+    return tuple(purposes)
 
 
 def _read(context: Context, camera, default_light: bool) -> SceneDict:
@@ -222,8 +229,8 @@ def _without_light(context: Context, scene: SceneDict, default_light: bool) -> N
         radiance = {"type": "rgb", "value": [1.0, 1.0, 1.0]}
         scene["environment"] = {"type": "constant", "radiance": radiance}
     else:
-        text = "the stage has no light: the image is black without --default-light"
-        text += " (default_light=True)"
+        option = typed("default_light=True", "--default-light")
+        text = f"the stage has no light: the image is black without {option}"
     context.notes.add("no light", text, "/")
 
 

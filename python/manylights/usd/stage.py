@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdUtils
 
-from manylights.errors import UsageError, one_line
+from manylights.errors import UsageError, number, one_line
 from manylights.usd.context import Notes
 
 #: Files with notes of their own; further missing ones share one.
@@ -72,8 +73,10 @@ def guarded(path):
 
 def time_of(stage: Usd.Stage, time: float | None) -> Usd.TimeCode:
     """Return the time to read at: as asked for, else the authored start, else the default."""
+    if isinstance(time, Usd.TimeCode):
+        return time
     if time is not None:
-        return time if isinstance(time, Usd.TimeCode) else Usd.TimeCode(float(time))
+        return Usd.TimeCode(number("time", time, math.isfinite, "a finite number"))
     if stage.HasAuthoredMetadata("startTimeCode"):
         return Usd.TimeCode(stage.GetStartTimeCode())
     return Usd.TimeCode.Default()

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, check
 from manylights.progress import say
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.job import FILMS, Job
@@ -46,7 +46,7 @@ def run(
         UsageError: not such a job, or no worker can take part.
         RuntimeError: a worker cannot render something, or the scheduler is gone.
     """
-    check(job, client)
+    check_job(job, client)
     team = Team(client, job, facts, threads, ship)
     foreman = Foreman(job, state, store, team, report)
     try:
@@ -57,10 +57,10 @@ def run(
         raise
 
 
-def check(job: Job, client) -> None:
+def check_job(job: Job, client) -> None:
     """Raise ``UsageError`` if workers cannot render a job."""
-    if client.asynchronous:
-        raise UsageError("client: must be a synchronous distributed.Client")
+    fits = not getattr(client, "asynchronous", True)
+    check("client", client, fits, "a synchronous distributed.Client")
     if job.course.seconds is not None:
         raise UsageError(
             "workers: need a number of samples or a noise. With a time as the target each step "

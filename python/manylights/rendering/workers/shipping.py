@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
 from manylights.loading import LoadedScene
 
 #: Endings of texts that name other files.
@@ -66,4 +66,4 @@ def check_names(path: Path, files: list[str]) -> None:
     text = path.read_text(errors="replace")
     named = next((file for file in files if file in text), None)
     if named is not None:
-        raise UsageError(f"--ship: {path} names {named}, which is elsewhere on workers")
+        raise UsageError(f"{argument('ship')}: {path} names {named}, which is elsewhere on workers")
