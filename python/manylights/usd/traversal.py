@@ -9,6 +9,7 @@ Matrices are those of USD: a point is a row vector, ``p @ M``.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +17,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from manylights.errors import one_line
 from manylights.usd.context import Context
+from manylights.usd.instance_keys import InstanceKeys
 
 #: More copies than this of one prototype do not fit into memory.
 LARGEST_BATCH = 20_000_000
@@ -107,9 +109,8 @@ class _Traversal:
         self.batches: list[Batch] = []
         self._waiting: list[tuple] = []
         self._native: dict[tuple, list[tuple[Usd.Prim, _State]]] = {}
-        self._inherited: dict[Sdf.Path, tuple] = {}
         self._roles: dict[tuple, str] = {}
-        self._below: dict[Sdf.Path, list[str]] = {}
+        self._keys = InstanceKeys(context)
 
     def run(self) -> list[Batch]:
         """Return the batches, see :func:`collect`."""
@@ -153,8 +154,7 @@ class _Traversal:
             return None
         state = self._enter(prim, imageable, state, is_root)
         if prim.IsInstance() and not is_root:
-            key = (prim.GetPrototype().GetPath(), state.purpose, self._inheritance(prim))
-            key = (*key, self._light_groups(prim))
+            key = (prim.GetPrototype().GetPath(), state.purpose, *self._keys.of(prim))
             self._native.setdefault(key, []).append((prim, state))
             return None
         if (state.purpose or UsdGeom.Tokens.default_) in self.context.purposes:
@@ -162,6 +162,8 @@ class _Traversal:
                 self._expand(UsdGeom.PointInstancer(prim), state, batch)
             elif role in ("light", "geometry"):
                 batch.items.append(Item(prim, state.matrix, role))
+                if prim.GetTypeName() == "GeometryLight":
+                    self._keys.point_to(prim)
             elif role == "unknown":
                 text = f"prims of type {prim.GetTypeName()} are left out"
                 self.context.notes.add(f"type {prim.GetTypeName()}", text, prim)
@@ -185,38 +187,11 @@ class _Traversal:
             matrix = own if xformable.GetResetXformStack() else own @ matrix
         return _State(matrix, purpose, state.chain)
 
-    def _inheritance(self, prim: Usd.Prim) -> tuple:
-        """Return the ancestors whose material or primvars an instance inherits, itself included."""
-        path = prim.GetPath()
-        if path not in self._inherited:
-            parent = prim.GetParent()
-            above = () if not parent or parent.IsPseudoRoot() else self._inheritance(parent)
-            names = prim.GetAuthoredPropertyNames()
-            counts = any(name.startswith(("material:binding", "primvars:")) for name in names)
-            self._inherited[path] = (*above, path) if counts else above
-        return self._inherited[path]
-
-    def _light_groups(self, prim: Usd.Prim) -> tuple:
-        """Return which entries of the light groups what is below an instance belongs to."""
-        groups = self.context.light_groups
-        if not groups:
-            return ()
-        prototype = prim.GetPrototype()
-        if prototype.GetPath() not in self._below:
-            root = str(prototype.GetPath())
-            parts = Usd.PrimRange(prototype, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
-            roles = ("light", "geometry", "instancer")
-            self._below[prototype.GetPath()] = [
-                str(part.GetPath())[len(root) :] for part in parts if self._role(part) in roles
-            ]
-        path = str(prim.GetPath())
-        return tuple(groups.entry_of(path + part) for part in self._below[prototype.GetPath()])
-
     def _flush_native(self, batch: Batch) -> None:
         """Make one batch of all native instances of a prototype that look the same."""
         groups, self._native = self._native, {}
         predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-        for members in groups.values():
+        for members in itertools.chain(*map(self._keys.apart, groups.values())):
             prim, state = members[0]
             matrices = np.stack([member.matrix for _, member in members])
             state = _State(np.eye(4), state.purpose, state.chain)
