@@ -1,4 +1,4 @@
-"""Native instances look as their prims would without instancing: materials, and lights on them."""
+"""Native instances look as their prims would without instancing, and are in the same places."""
 
 import mitsuba as mi
 import numpy as np
@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("pxr")
 
+from tests.test_usd_lights import emitters
 from tests.usd_stages import write_stage
 
 pytestmark = pytest.mark.usefixtures("scalar", "plugin")
@@ -213,3 +214,29 @@ def test_instances_that_look_the_same_stay_copies(tmp_path):
     kinds = [part["type"] for part in scene.values() if isinstance(part, dict)]
     assert kinds.count("shapegroup") == 2
     assert kinds.count("instance") == 12
+
+
+RESET = 'uniform token[] xformOpOrder = ["!resetXformStack!", "xformOp:translate"];'
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_a_prim_that_resets_its_transform_does_not_move_with_its_instance(tmp_path, nested):
+    """A mesh, an instance and a light, in instances and in instances of these."""
+    from manylights import usd
+
+    fixed = f"""def Mesh "fixed" {{ ; SQUARE ; double3 xformOp:translate = (0, 4, 0);{RESET} }}
+        def Xform "group" (instanceable = true;references = </Q>) {{
+            double3 xformOp:translate = (4, 4, 0);{RESET} }}
+        def SphereLight "light" {{ ; bool treatAsPoint = true;float inputs:intensity = 5
+            double3 xformOp:translate = (1, 2, 3);{RESET} }}"""
+    square = 'class Xform "Q" { ; def Mesh "in" { ; SQUARE } };'
+    text = stage(prototype='def Mesh "moved" { ; SQUARE }' + fixed)
+    if nested:
+        outer = 'class Xform "R" {;def Xform "p" (instanceable = true;references = </P>) {;};};'
+        text = outer + text.replace("</P>", "</R>")
+    text = placed(square) + placed(text)
+    places = [(0, 0, 5), (4, 0, 5), (8, 0, 5), (0, 4, 5), (4, 4, 5)]
+    assert_as_without_instancing(tmp_path, text, places, distinct=1)
+    scene = usd.load(tmp_path / "instanced.usda")
+    points = [part["position"] for part in emitters(scene, "point")]
+    assert np.allclose(points, [(1, 2, 3)] * 3)

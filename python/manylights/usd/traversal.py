@@ -25,6 +25,9 @@ LARGEST_BATCH = 20_000_000
 #: Instancers that instance each other reach this soon, others never.
 MOST_BATCHES = 100_000
 
+#: What is drawn by itself, also in native instances.
+PROXIES = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+
 #: Types that only hold others, and types that others look up.
 CONTAINERS = ("Xform", "Scope", "SkelRoot", "Camera", "Skeleton", "LightFilter")
 LOOKED_UP = ("Material", "Shader", "NodeGraph", "GeomSubset")
@@ -53,11 +56,14 @@ class Batch:
         transforms: ``(n, 4, 4)`` to the world.
         items: in the order of the stage.
         instancers: paths of the point instancers that they are in.
+        outer: ``(k, 4, 4)`` of native instances: where ``!resetXformStack!`` leads to, to which
+            every k copies return. ``None``: to the batch.
     """
 
     transforms: np.ndarray
     items: list[Item] = field(default_factory=list)
     instancers: tuple[Sdf.Path, ...] = ()
+    outer: np.ndarray | None = None
 
     def worlds(self, item: Item) -> np.ndarray:
         """Return the transforms of an item to the world, ``(n, 4, 4)``."""
@@ -66,11 +72,15 @@ class Batch:
 
 @dataclass
 class _State:
-    """What prims inherit: transform, purpose, and the instancers that they are in."""
+    """What prims inherit: transform, purpose, and the instancers that they are in.
+
+    Whether a prim's own transform is that to the world is not inherited.
+    """
 
     matrix: np.ndarray
     purpose: str | None = None
     chain: tuple[Sdf.Path, ...] = ()
+    resets: bool = False
 
 
 def collect(context: Context) -> list[Batch]:
@@ -116,8 +126,7 @@ class _Traversal:
         """Return the batches, see :func:`collect`."""
         batch = Batch(np.eye(4)[None])
         root = self.context.stage.GetPseudoRoot()
-        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-        self._walk(root, _State(np.eye(4)), batch, predicate)
+        self._walk(root, _State(np.eye(4)), batch, PROXIES)
         while self._waiting:
             self._walk(*self._waiting.pop())
         return [batch for batch in self.batches if batch.items]
@@ -153,6 +162,9 @@ class _Traversal:
         if self.context.value(imageable.GetVisibilityAttr()) == UsdGeom.Tokens.invisible:
             return None
         state = self._enter(prim, imageable, state, is_root)
+        if state.resets and batch.outer is not None:
+            self._wait_outside(prim, state, batch)
+            return None
         if prim.IsInstance() and not is_root:
             key = (prim.GetPrototype().GetPath(), state.purpose, *self._keys.of(prim))
             self._native.setdefault(key, []).append((prim, state))
@@ -177,25 +189,34 @@ class _Traversal:
 
     def _enter(self, prim, imageable, state: _State, is_root: bool) -> _State:
         """Return the state with a prim's own purpose and transform."""
-        purpose, matrix = state.purpose, state.matrix
+        purpose, matrix, resets = state.purpose, state.matrix, False
         authored = imageable.GetPurposeAttr()
         if authored and authored.HasAuthoredValue():
             purpose = authored.Get()
         xformable = UsdGeom.Xformable(prim)
         if xformable and not is_root and prim.HasProperty("xformOpOrder"):
             own = local_matrix(xformable, self.context.time)
-            matrix = own if xformable.GetResetXformStack() else own @ matrix
-        return _State(matrix, purpose, state.chain)
+            resets = xformable.GetResetXformStack()
+            matrix = own if resets else own @ matrix
+        return _State(matrix, purpose, state.chain, resets)
 
     def _flush_native(self, batch: Batch) -> None:
         """Make one batch of all native instances of a prototype that look the same."""
         groups, self._native = self._native, {}
-        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+        outer = batch.transforms if batch.outer is None else batch.outer
         for members in itertools.chain(*map(self._keys.apart, groups.values())):
             prim, state = members[0]
             matrices = np.stack([member.matrix for _, member in members])
             state = _State(np.eye(4), state.purpose, state.chain)
-            self._wait(prim, state, matrices, batch, predicate)
+            self._wait(prim, state, matrices, batch, PROXIES, outer)
+
+    def _wait_outside(self, prim: Usd.Prim, state: _State, batch: Batch) -> None:
+        """Make a batch of a prim that does not move with the native instances that it is in."""
+        outside = Batch(batch.outer)
+        times = len(batch.transforms) // len(batch.outer)
+        matrices = np.tile(state.matrix, (times, 1, 1))
+        state = _State(np.eye(4), state.purpose, state.chain)
+        self._wait(prim, state, matrices, outside, PROXIES, batch.outer)
 
     def _expand(self, instancer: UsdGeom.PointInstancer, state: _State, batch: Batch) -> None:
         """Make one batch of all instances of each prototype."""
@@ -271,7 +292,7 @@ class _Traversal:
             matrices[chosen] = own @ matrices[chosen]
         return matrices
 
-    def _wait(self, root, state: _State, matrices, batch: Batch, predicate) -> None:
+    def _wait(self, root, state: _State, matrices, batch: Batch, predicate, outer=None) -> None:
         """Remember a prototype to walk through once for all its copies."""
         count = len(matrices) * len(batch.transforms)
         if count > LARGEST_BATCH or len(self.batches) > MOST_BATCHES:
@@ -281,7 +302,7 @@ class _Traversal:
             self.context.notes.add("instances", text, root, count)
             return
         transforms = (matrices[:, None] @ batch.transforms[None]).reshape(-1, 4, 4)
-        batch = Batch(transforms, instancers=state.chain)
+        batch = Batch(transforms, instancers=state.chain, outer=outer)
         self._waiting.append((root, state, batch, predicate))
 
 
