@@ -66,6 +66,19 @@ def as_rows(value, width: int) -> np.ndarray | None:
     return array if array.ndim == 2 and array.shape[1] == width else None
 
 
+def integers(value) -> np.ndarray:
+    """Return an array of whole numbers as ``(n,)`` int64, an empty one for ``None``.
+
+    Raises:
+        ValueError: they are of another type.
+    """
+    array = np.asarray(value if value is not None else [])
+    if array.size and array.dtype.kind not in "iu":
+        shown = " ".join(str(value).split())[:60]
+        raise ValueError(f"{shown} is no array of whole numbers")
+    return array.astype(np.int64).ravel()
+
+
 def read_primvar(primvar, width: int, sizes: Sizes, context) -> Values | None:
     """Read a ``UsdGeom.Primvar``, ``None`` and a note if it does not fit its prim."""
     if not primvar:
@@ -77,7 +90,7 @@ def read_primvar(primvar, width: int, sizes: Sizes, context) -> Values | None:
     indices = context.value(primvar.GetIndicesAttr()) if primvar.IsIndexed() else None
     where = f"{primvar.GetAttr().GetPath()}"
     if indices is not None and len(indices):
-        rows = _indexed(rows, np.asarray(indices), where, context.notes)
+        rows = _indexed(rows, integers(indices), where, context.notes)
     return fitting(rows, primvar.GetInterpolation(), sizes, where, context.notes)
 
 

@@ -148,5 +148,5 @@ def _plain(value):
         return value.resolvedPath or value.path
     try:
         return [float(part) for part in value]
-    except TypeError:
+    except (TypeError, ValueError):
         return str(value)

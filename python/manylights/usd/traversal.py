@@ -18,6 +18,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 from manylights.errors import one_line
 from manylights.usd.context import Context
 from manylights.usd.instance_keys import InstanceKeys
+from manylights.usd.primvars import integers
 
 #: More copies than this of one prototype do not fit into memory.
 LARGEST_BATCH = 20_000_000
@@ -249,7 +250,7 @@ class _Traversal:
         indices = self.context.value(instancer.GetProtoIndicesAttr())
         if indices is None or not len(indices):
             return none
-        indices = np.array(indices, dtype=np.int64)
+        indices = integers(indices)
         if time.IsDefault() and instancer.GetPositionsAttr().Get() is None:
             time = Usd.TimeCode.EarliestTime()
         # With a mask applied the matrices would be fewer than the indices. Prototypes that are
