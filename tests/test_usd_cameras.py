@@ -176,6 +176,12 @@ def test_stage_without_camera_is_framed(load, axis):
     assert up["XYZ".index(axis)] > 0.5
 
 
+def test_clipping_planes_are_noted(load):
+    scene = load(LIGHT + camera("float4[] clippingPlanes = [(0, 0, 1, 5)];"))
+    assert "/camera" in note(scene, "clippingPlanes")
+    assert not note(load(LIGHT + camera()), "clippingPlanes")
+
+
 @pytest.mark.parametrize("attribute", ["focalLength", "horizontalAperture", "verticalAperture"])
 @pytest.mark.parametrize("value", ["0", "-1", "nan"])
 def test_broken_cameras_are_noted(load, attribute, value):

@@ -255,6 +255,13 @@ def test_overlapping_subsets_keep_the_first_and_say_so():
     assert [s.face_of.tolist() for s in surfaces] == [[0, 0, 1, 1]]
 
 
+def test_subsets_of_points_have_no_material_of_their_own():
+    text = mesh(TWO_SQUARES + subset("s", [1]).replace('"face"', '"point"'))
+    surfaces, notes = read(text)
+    assert [str(s.binding.GetPath()) for s in surfaces] == ["/a"]
+    assert "/a/s" in notes[0].text and "type point" in notes[0].text
+
+
 # --- broken meshes ---
 
 
@@ -553,9 +560,11 @@ def test_tetrahedra_show_their_outside():
     assert volume(surface) == pytest.approx(1 / 6)
 
 
-def test_types_that_are_left_out_are_noted():
-    surfaces, notes = read('def NurbsPatch "a" {\n}')
-    assert not surfaces and notes[0].kind == "NurbsPatch"
+@pytest.mark.parametrize("kind", ["NurbsPatch", "Volume", "ParticleField3DGaussianSplat"])
+def test_types_that_are_left_out_are_noted(kind):
+    surfaces, notes = read(f'def {kind} "a" {{\n}}')
+    assert not surfaces
+    assert f"prims of type {kind} are left out" in notes[0].text and "/a" in notes[0].text
     assert corners(only('def Cube "a" {}')).shape == (12, 3, 3)
 
 

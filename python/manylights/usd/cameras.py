@@ -72,6 +72,9 @@ def sensor_of(prim: Usd.Prim, context: Context, settings: RenderSettings) -> tup
     """Return a camera as a sensor and the factor of its exposure."""
     camera = UsdGeom.Camera(prim)
     values = _Values(camera, context)
+    if len(context.value(camera.GetClippingPlanesAttr(), ())):
+        text = "the clippingPlanes of a camera were ignored, it sees what they cut away"
+        context.notes.add("clippingPlanes", text, prim)
     width, height = _resolution(settings, values.aspect())
     horizontal, vertical = settings.conform(values.horizontal, values.vertical, width / height)
     frame, position = _frame(prim, context)

@@ -159,6 +159,9 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
             if item.prim.GetTypeName() == "GeometryLight":
                 relation = item.prim.GetRelationship("geometry")
                 for target in relation.GetForwardedTargets() if relation else ():
+                    if target in result:
+                        text = f"{target} is the geometry of several lights: it has the last one's"
+                        context.notes.add("geometry light", text, item.prim)
                     result[target] = item.prim
     for target, prim in result.items():
         if target not in drawn:

@@ -221,6 +221,11 @@ def _split(whole: Surface, prim, face_count: int, context) -> list[Surface]:
         return [whole]
     owner = np.full(face_count, -1)
     for number, subset in enumerate(subsets):
+        element = context.value(subset.GetElementTypeAttr(), "face")
+        if element != "face":
+            text = f"the material of a subset of elements of the type {element} is left out"
+            context.notes.add("subset type", text, subset.GetPrim())
+            continue
         faces = context.value(subset.GetIndicesAttr())
         faces = _indices(faces, face_count, subset.GetPrim(), context)
         if (owner[faces] >= 0).any():
