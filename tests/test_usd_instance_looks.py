@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("pxr")
 
-from tests.test_usd_lights import emitters
+from tests.test_usd_lights import emitters, note
 from tests.usd_stages import write_stage
 
 pytestmark = pytest.mark.usefixtures("scalar", "plugin")
@@ -240,3 +240,58 @@ def test_a_prim_that_resets_its_transform_does_not_move_with_its_instance(tmp_pa
     scene = usd.load(tmp_path / "instanced.usda")
     points = [part["position"] for part in emitters(scene, "point")]
     assert np.allclose(points, [(1, 2, 3)] * 3)
+
+
+# -- Colors of point instancers
+
+
+def colored(colors, more="", inside="", count=4):
+    """Return an instancer of squares four apart with displayColor for each instance."""
+    positions = ", ".join(f"({4 * index}, 0, 0)" for index in range(count))
+    text = f"""def PointInstancer "squares" {{ ; rel prototypes = </squares/square>
+        int[] protoIndices = {[0] * count}; point3f[] positions = [{positions}]
+        color3f[] primvars:displayColor = {colors} (interpolation = "vertex")
+        {more} def Xform "square" {{ ; def Mesh "m" {{ ; SQUARE ; {inside} }} }} }}"""
+    return placed(text)
+
+
+ROW = [(4.0 * index, 0.0, 5.0) for index in range(4)]
+RGBR = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0)]
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        (colored(RGBR), RGBR),
+        (colored(RGBR[:3], "int[] primvars:displayColor:indices = [2, 1, 0, 2];"),
+         [RGBR[2], RGBR[1], RGBR[0], RGBR[2]]),
+        (colored(RGBR, "int64[] invisibleIds = [1];"), [RGBR[0], (-1, -1, -1), *RGBR[2:]]),
+        (colored(RGBR, "", "color3f[] primvars:displayColor = [(0.5, 0.5, 0)];"),
+         [(0.5, 0.5, 0)] * 4),
+        (colored(RGBR[:1]), [RGBR[0]] * 4),
+    ],
+)  # fmt: skip
+def test_instances_have_the_colors_that_their_instancer_gives(tmp_path, text, expected):
+    """Those of a mesh itself are stronger."""
+    found = looks(write_stage(tmp_path, text), ROW)
+    assert np.allclose(found[:, 0], expected, atol=1e-6)
+
+
+def test_colors_reach_instances_in_prototypes(tmp_path):
+    square = placed('class Xform "Q" { ; def Mesh "in" { ; SQUARE } };')
+    instance = 'def Xform "m" (instanceable = true;references = </Q>) {'
+    text = colored(RGBR).replace('def Mesh "m" {', instance).replace(placed("SQUARE"), "")
+    found = assert_as_without_instancing(tmp_path, square + text, ROW, distinct=3)
+    assert np.allclose(found[:, 0], RGBR)
+
+
+def test_colors_that_do_not_fit_are_noted(tmp_path):
+    from manylights import usd
+
+    scene = usd.load(write_stage(tmp_path, colored(RGBR[:2]), "few.usda"))
+    assert "/squares" in note(scene, "primvar size")
+    many = [(index / 300, 0, 0) for index in range(300)]
+    scene = usd.load(write_stage(tmp_path, colored(many, count=300), "many.usda"))
+    assert "300 colors" in note(scene, "instance colors")
+    kinds = [part["type"] for part in scene.values() if isinstance(part, dict)]
+    assert "shapegroup" not in kinds

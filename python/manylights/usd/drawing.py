@@ -78,6 +78,8 @@ class Scenery:
         surfaces = [surface for surface in surfaces if len(surface.faces)]
         if not surfaces:
             return []
+        if batch.color is not None:
+            _give_color(surfaces, batch.color)
         worlds = batch.worlds(item)
         self._corners += [_box(surface.positions, worlds) for surface in surfaces]
         light = self._light(item.prim)
@@ -168,6 +170,14 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
             text = f"a GeometryLight points to {target}, which is not drawn"
             context.notes.add("geometry light", text, prim)
     return result
+
+
+def _give_color(surfaces: list[Surface], color: np.ndarray) -> None:
+    """Set the displayColor of surfaces that have none."""
+    for surface in surfaces:
+        if surface.colors is None:
+            surface.colors = np.tile(np.float32(color), (len(surface.faces), 1))
+            surface.colors_per = "face"
 
 
 def _box(positions: np.ndarray, matrices: np.ndarray) -> np.ndarray:

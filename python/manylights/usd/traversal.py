@@ -18,7 +18,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 from manylights.errors import one_line
 from manylights.usd.context import Context
 from manylights.usd.instance_keys import InstanceKeys
-from manylights.usd.primvars import integers
+from manylights.usd.primvars import Sizes, display_color, integers
 
 #: More copies than this of one prototype do not fit into memory.
 LARGEST_BATCH = 20_000_000
@@ -28,6 +28,9 @@ MOST_BATCHES = 100_000
 
 #: What is drawn by itself, also in native instances.
 PROXIES = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+
+#: Instancers with more colors than this would become too many groups of instances.
+MOST_COLORS = 256
 
 #: Types that only hold others, and types that others look up.
 CONTAINERS = ("Xform", "Scope", "SkelRoot", "Camera", "Skeleton", "LightFilter")
@@ -59,12 +62,14 @@ class Batch:
         instancers: paths of the point instancers that they are in.
         outer: ``(k, 4, 4)`` of native instances: where ``!resetXformStack!`` leads to, to which
             every k copies return. ``None``: to the batch.
+        color: that an instancer gives these instances, ``(3,)`` or ``None``.
     """
 
     transforms: np.ndarray
     items: list[Item] = field(default_factory=list)
     instancers: tuple[Sdf.Path, ...] = ()
     outer: np.ndarray | None = None
+    color: np.ndarray | None = None
 
     def worlds(self, item: Item) -> np.ndarray:
         """Return the transforms of an item to the world, ``(n, 4, 4)``."""
@@ -209,27 +214,30 @@ class _Traversal:
             prim, state = members[0]
             matrices = np.stack([member.matrix for _, member in members])
             state = _State(np.eye(4), state.purpose, state.chain)
-            self._wait(prim, state, matrices, batch, PROXIES, outer)
+            self._wait(prim, state, matrices, batch, PROXIES, outer=outer)
 
     def _wait_outside(self, prim: Usd.Prim, state: _State, batch: Batch) -> None:
         """Make a batch of a prim that does not move with the native instances that it is in."""
-        outside = Batch(batch.outer)
+        outside = Batch(batch.outer, color=batch.color)
         times = len(batch.transforms) // len(batch.outer)
         matrices = np.tile(state.matrix, (times, 1, 1))
         state = _State(np.eye(4), state.purpose, state.chain)
-        self._wait(prim, state, matrices, outside, PROXIES, batch.outer)
+        self._wait(prim, state, matrices, outside, PROXIES, outer=batch.outer)
 
     def _expand(self, instancer: UsdGeom.PointInstancer, state: _State, batch: Batch) -> None:
-        """Make one batch of all instances of each prototype."""
+        """Make one batch of all instances of each prototype and color."""
         prim, notes = instancer.GetPrim(), self.context.notes
         if prim.GetPath() in state.chain:
             notes.add("cycle", "a PointInstancer that instances itself was left out there", prim)
             return
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
-        indices, matrices = self._instances(instancer, len(targets))
+        indices, matrices, numbers = self._instances(instancer, len(targets))
+        colors, color_of = self._colors(instancer, numbers)
         inside = _State(np.eye(4), state.purpose, (*state.chain, prim.GetPath()))
-        for index in np.unique(indices):
-            root, chosen = self.context.stage.GetPrimAtPath(targets[index]), indices == index
+        groups = indices * len(colors) + color_of
+        for group in np.unique(groups):
+            index, color = divmod(int(group), len(colors))
+            root, chosen = self.context.stage.GetPrimAtPath(targets[index]), groups == group
             if not root:
                 text = f"a PointInstancer has no prototype {targets[index]}"
                 notes.add("prototype", text, prim, int(chosen.sum()))
@@ -241,12 +249,40 @@ class _Traversal:
                 predicate = predicate & ~Usd.PrimIsAbstract
             predicate = Usd.TraverseInstanceProxies(predicate)
             if root.IsActive():
-                self._wait(root, inside, matrices[chosen] @ state.matrix, batch, predicate)
+                places = matrices[chosen] @ state.matrix
+                self._wait(root, inside, places, batch, predicate, color=colors[color])
+
+    def _colors(self, instancer: UsdGeom.PointInstancer, numbers: np.ndarray):
+        """Return the colors of an instancer's instances, and which of them each instance has.
+
+        Args:
+            instancer: with displayColor for each instance, or without.
+            numbers: ``(n,)``, which ones are wanted.
+        """
+        prim, notes = instancer.GetPrim(), self.context.notes
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
+        if not len(numbers) or not primvar or primvar.GetInterpolation() == "constant":
+            return [None], 0
+        count = len(self.context.value(instancer.GetProtoIndicesAttr()))
+        values = display_color(prim, Sizes(count, count, count), self.context)[0]
+        if values is None:
+            return [None], 0
+        rows = np.broadcast_to(values.array, (count, 3))[numbers]
+        colors, color_of = np.unique(rows, axis=0, return_inverse=True)
+        if len(colors) > MOST_COLORS:
+            text = f"the {len(colors)} colors of an instancer are more than {MOST_COLORS}: not used"
+            notes.add("instance colors", text, prim)
+            return [None], 0
+        return colors, np.ravel(color_of)
 
     def _instances(self, instancer: UsdGeom.PointInstancer, prototypes: int):
-        """Return prototype and matrix of each visible instance, ``(n,)`` and ``(n, 4, 4)``."""
+        """Return prototype, matrix and number of each visible instance.
+
+        They have the shapes ``(n,)``, ``(n, 4, 4)`` and ``(n,)``.
+        """
         prim, notes, time = instancer.GetPrim(), self.context.notes, self.context.time
-        none = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
+        empty = np.zeros(0, dtype=np.int64)
+        none = empty, np.zeros((0, 4, 4)), empty
         indices = self.context.value(instancer.GetProtoIndicesAttr())
         if indices is None or not len(indices):
             return none
@@ -275,7 +311,8 @@ class _Traversal:
             text = "an instance with an index out of range or a transform that is not finite"
             notes.add("instance", f"{text} was left out", prim, int((bad & keep).sum()))
         keep = keep & ~bad
-        return indices[keep], self._with_prototypes(instancer, indices[keep], matrices[keep])
+        matrices = self._with_prototypes(instancer, indices[keep], matrices[keep])
+        return indices[keep], matrices, np.flatnonzero(keep)
 
     def _with_prototypes(self, instancer, indices, matrices) -> np.ndarray:
         """Return instances' matrices with the transform of each prototype's root before."""
@@ -293,8 +330,17 @@ class _Traversal:
             matrices[chosen] = own @ matrices[chosen]
         return matrices
 
-    def _wait(self, root, state: _State, matrices, batch: Batch, predicate, outer=None) -> None:
-        """Remember a prototype to walk through once for all its copies."""
+    def _wait(self, root, state: _State, matrices, batch: Batch, predicate, **look) -> None:
+        """Remember a prototype to walk through once for all its copies.
+
+        Args:
+            root: of the prototype.
+            state: that it inherits.
+            matrices: ``(n, 4, 4)`` of the copies.
+            batch: that they are in.
+            predicate: of the prims to walk through.
+            look: ``outer`` and ``color`` of the new batch. Default: none, that of ``batch``.
+        """
         count = len(matrices) * len(batch.transforms)
         if count > LARGEST_BATCH or len(self.batches) > MOST_BATCHES:
             text = (
@@ -303,7 +349,9 @@ class _Traversal:
             self.context.notes.add("instances", text, root, count)
             return
         transforms = (matrices[:, None] @ batch.transforms[None]).reshape(-1, 4, 4)
-        batch = Batch(transforms, instancers=state.chain, outer=outer)
+        if look.get("color") is None:
+            look["color"] = batch.color
+        batch = Batch(transforms, instancers=state.chain, **look)
         self._waiting.append((root, state, batch, predicate))
 
 
