@@ -161,7 +161,7 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
             if item.prim.GetTypeName() == "GeometryLight":
                 relation = item.prim.GetRelationship("geometry")
                 for target in relation.GetForwardedTargets() if relation else ():
-                    if target in result:
+                    if result.get(target, item.prim) != item.prim:
                         text = f"{target} is the geometry of several lights: it has the last one's"
                         context.notes.add("geometry light", text, item.prim)
                     result[target] = item.prim
