@@ -762,6 +762,25 @@ def test_standard_surface():
     assert not notes
 
 
+@pytest.mark.parametrize(
+    "node, weight, index",
+    [
+        ("ND_standard_surface_surfaceshader", "specular", "specular_IOR"),
+        ("ND_open_pbr_surface_surfaceshader", "specular_weight", "specular_ior"),
+    ],
+)
+@pytest.mark.parametrize("share", [0.0, 0.25, 2.0])
+def test_specular_weight_scales_the_reflectance_at_normal_incidence(node, weight, index, share):
+    inputs = f"float inputs:{weight} = {share}\nfloat inputs:{index} = 1.6"
+    material, notes = material_of(square() + mtlx(node, inputs))
+    eta = principled(material)["eta"]
+    reflectance = share * (0.6 / 2.6) ** 2
+    assert ((eta - 1) / (eta + 1)) ** 2 == pytest.approx(reflectance, abs=1e-7)
+    assert not notes
+    _, notes = material_of(square() + mtlx(node, "color3f inputs:specular_color = (1, .5, 1)"))
+    assert "specular_color" in notes[0].text
+
+
 def test_open_pbr_surface_and_its_fallbacks():
     text = mtlx("ND_open_pbr_surface_surfaceshader", "float inputs:emission_luminance = 5")
     material, _ = material_of(square() + text)
