@@ -262,6 +262,20 @@ def test_subsets_of_points_have_no_material_of_their_own():
     assert "/a/s" in notes[0].text and "type point" in notes[0].text
 
 
+@pytest.mark.parametrize("kind", ["texCoord3f", "texCoord3h", "texCoord3d"])
+def test_texture_coordinates_of_three_numbers_lose_the_last(kind):
+    values = f"{kind}[] primvars:uv = [(0, 1, 7), (1, 1, 7), (1, 0, 7), (0, 0, 7)] ("
+    surface = only(mesh(SQUARE + values + '\ninterpolation = "vertex"\n)'))
+    assert surface.uv_sets["uv"].tolist() == [[0, 1], [1, 1], [1, 0], [0, 0]]
+
+
+def test_colors_of_four_numbers_are_noted():
+    surfaces, notes = read(mesh(SQUARE + "color4f[] primvars:displayColor = [(1, 0, 0, 1)]"))
+    assert surfaces[0].colors is None
+    assert "/a.primvars:displayColor" in notes[0].text and "3 numbers" in notes[0].text
+    assert not read(mesh(SQUARE + "color4f[] primvars:displayColor = []"))[1]
+
+
 # --- broken meshes ---
 
 

@@ -85,6 +85,9 @@ def read_primvar(primvar, width: int, sizes: Sizes, context) -> Values | None:
         return None
     value = context.value(primvar.GetAttr())
     rows = None if value is None else as_rows(value, width)
+    if rows is None and value is not None and np.size(value):
+        text = f"values that are not {width} numbers each are not used"
+        context.notes.add("primvar type", text, primvar.GetAttr().GetPath())
     if rows is None or not len(rows):
         return None
     indices = context.value(primvar.GetIndicesAttr()) if primvar.IsIndexed() else None
@@ -124,9 +127,12 @@ def texture_coordinates(prim, sizes: Sizes, context) -> dict[str, Values]:
     """Return all texture coordinates of a prim by name, ``st`` first if there is one."""
     found = {}
     for primvar in UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance():
-        if primvar.GetTypeName().scalarType.cppTypeName in ("GfVec2f", "GfVec2d", "GfVec2h"):
-            values = read_primvar(primvar, 2, sizes, context)
+        kind = primvar.GetTypeName()
+        in_plane = kind.scalarType.cppTypeName in ("GfVec2f", "GfVec2d", "GfVec2h")
+        if in_plane or kind.role == "TextureCoordinate":
+            values = read_primvar(primvar, 2 if in_plane else 3, sizes, context)
             if values is not None:
+                values.array = values.array[:, :2]
                 found[primvar.GetPrimvarName()] = finite(values, primvar, context.notes)
     return dict(sorted(found.items(), key=lambda item: (item[0] != "st", item[0])))
 
