@@ -95,7 +95,8 @@ def sensor_of(prim: Usd.Prim, context: Context, settings: RenderSettings) -> tup
         if offset_x or offset_y:
             sensor["principal_point_offset_x"] = offset_x / horizontal
             sensor["principal_point_offset_y"] = -offset_y / vertical
-        values.add_lens(sensor)
+        if settings.has_lens():
+            values.add_lens(sensor)
     sensor.update(_film_and_sampler(width, height, settings))
     settings.apply_to_sensor(prim, sensor)
     return sensor, values.exposure()
