@@ -333,6 +333,19 @@ def test_deep_stage(usd, tmp_path):
     assert len(mi.load_dict(usd.load(path)).emitters()) == 1
 
 
+def test_deep_instance(usd, tmp_path):
+    """Deeper than Python's functions may call each other."""
+    path, place = str(tmp_path / "deep.usda"), "/" + "/".join(["a"] * 1200)
+    stage = Usd.Stage.CreateNew(path)
+    stage.CreateClassPrim("/lamp")
+    UsdLux.SphereLight.Define(stage, "/lamp/light")
+    instance = UsdGeom.Xform.Define(stage, place).GetPrim()
+    instance.GetReferences().AddInternalReference("/lamp")
+    instance.SetInstanceable(True)
+    stage.Save()
+    assert len(mi.load_dict(usd.load(path)).emitters()) == 1
+
+
 def test_too_many_instances_are_noted(usd, tmp_path):
     """Four levels of a hundred instances each are more than memory holds."""
     stage = Usd.Stage.CreateNew(str(tmp_path / "many.usda"))

@@ -54,16 +54,19 @@ class InstanceKeys:
 
     def _inheritance(self, prim: Usd.Prim) -> tuple[Sdf.Path, ...]:
         """Return the ancestors whose material or primvars an instance inherits, itself included."""
-        path = prim.GetPath()
-        if path not in self._inherited:
-            parent = prim.GetParent()
-            above = () if not parent or parent.IsPseudoRoot() else self._inheritance(parent)
-            names = prim.GetAuthoredPropertyNames()
-            counts = any(name.startswith(("material:binding", "primvars:")) for name in names)
-            self._inherited[path] = (*above, path) if counts else above
-            if any(name.startswith("material:binding:collection") for name in names):
-                self._queries[path] = _queries(prim)
-        return self._inherited[path]
+        chain, path = [], prim.GetPath()
+        while path not in self._inherited and not prim.IsPseudoRoot():
+            chain.append(prim)
+            prim, path = prim.GetParent(), path.GetParentPath()
+        above = self._inherited.get(path, ())
+        for prim in reversed(chain):
+            path, names = prim.GetPath(), prim.GetAuthoredPropertyNames()
+            if any(name.startswith(("material:binding", "primvars:")) for name in names):
+                above = (*above, path)
+                if any(name.startswith("material:binding:collection") for name in names):
+                    self._queries[path] = _queries(prim)
+            self._inherited[path] = above
+        return above
 
     def _memberships(self, prim: Usd.Prim, above: tuple[Sdf.Path, ...]) -> tuple[bool, ...]:
         """Return which parts of an instance the collections that bind from above include."""
