@@ -269,8 +269,10 @@ def test_texture_coordinates_of_three_numbers_lose_the_last(kind):
     assert surface.uv_sets["uv"].tolist() == [[0, 1], [1, 1], [1, 0], [0, 0]]
 
 
-def test_colors_of_four_numbers_are_noted():
-    surfaces, notes = read(mesh(SQUARE + "color4f[] primvars:displayColor = [(1, 0, 0, 1)]"))
+def test_colors_of_four_numbers_lose_the_last_and_of_two_are_noted():
+    surface = only(mesh(SQUARE + "color4f[] primvars:displayColor = [(1, 0, 0.5, 1)]"))
+    assert (surface.colors == [1, 0, 0.5]).all()
+    surfaces, notes = read(mesh(SQUARE + "float2[] primvars:displayColor = [(1, 0)]"))
     assert surfaces[0].colors is None
     assert "/a.primvars:displayColor" in notes[0].text and "3 numbers" in notes[0].text
     assert not read(mesh(SQUARE + "color4f[] primvars:displayColor = []"))[1]

@@ -85,6 +85,8 @@ def read_primvar(primvar, width: int, sizes: Sizes, context) -> Values | None:
         return None
     value = context.value(primvar.GetAttr())
     rows = None if value is None else as_rows(value, width)
+    if rows is None and width == 3 and (four := as_rows(value, 4)) is not None:
+        rows = four[:, :3]  # colors with alpha
     if rows is None and value is not None and np.size(value):
         text = f"values that are not {width} numbers each are not used"
         context.notes.add("primvar type", text, primvar.GetAttr().GetPath())
@@ -149,9 +151,9 @@ def finite(values: Values, primvar, notes) -> Values:
 
 
 def display_color(prim, sizes: Sizes, context) -> tuple[Values | None, Values | None]:
-    """Return displayColor and displayOpacity, clamped to 0..1."""
+    """Return displayColor, or what the context has in its place, and displayOpacity, in 0..1."""
     result = []
-    for name, width in (("displayColor", 3), ("displayOpacity", 1)):
+    for name, width in ((context.color_primvar, 3), ("displayOpacity", 1)):
         primvar = find(prim, name)
         values = read_primvar(primvar, width, sizes, context)
         if values is not None:
