@@ -14,7 +14,7 @@ pytest.importorskip("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 
 from tests.test_usd_instancing import PLACES, instancer
-from tests.test_usd_lights import QUAD, note
+from tests.test_usd_lights import BOUND, GLOW, QUAD, note
 from tests.usd_stages import write_stage
 
 pytestmark = pytest.mark.usefixtures("scalar", "plugin")
@@ -201,6 +201,8 @@ def test_instancers_that_instance_each_other(usd, tmp_path):
         'def Camera "bad" {;string clippingRange = "near";token projection = "none";}',
         'def RenderSettings "bad" {;string resolution = "high";int camera = 1;}',
         'def RenderSettings "bad" {;string mitsuba:sample_count = "many";}',
+        'def RenderSettings "bad" {;int[] resolution = [1];}',
+        'def BasisCurves "bad" {;point3f[] points = [(0, 0, 0)];float[] curveVertexCounts = [1];}',
     ],
 )
 def test_attributes_of_another_type(usd, tmp_path, text):
@@ -211,6 +213,37 @@ def test_attributes_of_another_type(usd, tmp_path, text):
     except usd.StageError as error:
         assert "/bad" in str(error)
         return
+    mi.load_dict(scene)
+
+
+@pytest.mark.parametrize(
+    "change, text",
+    [
+        (
+            ("int[] faceVertexIndices = [0, 1, 2, 3]", "float faceVertexIndices = 1e38"),
+            "a geometry could not be read",
+        ),
+        (
+            ("int[] faceVertexCounts = [4]", "double[] faceVertexCounts = [4]"),
+            "a geometry could not be read",
+        ),
+        (
+            ("", 'uniform token subdivisionScheme = "catmullClark";double creaseLengths = 1e38'),
+            "a geometry could not be read",
+        ),
+        (("", "color3f[] primvars:displayColor = [(1, 0, 0)];BAD"), "a geometry could not be read"),
+        (('token info:id = "UsdPreviewSurface"', 'string[] info:id = ["y"]'), "grey"),
+    ],
+)
+def test_meshes_and_shaders_with_values_of_another_type(usd, tmp_path, change, text):
+    """The mesh or its material is left out and noted, the rest is there."""
+    old, new = change
+    new = new.replace("BAD", "quath[] primvars:displayColor:indices = [(1, 0, 0, 0)]")
+    bad = f'def Mesh "bad" {{;{QUAD}{BOUND}}}{GLOW}'
+    bad = bad.replace(old, new) if old else bad.replace(QUAD, f"{QUAD}{new};")
+    assert bad.count(new) == 1
+    scene = usd.load(write_stage(tmp_path, LIT + bad))
+    assert text in texts(scene) and ("/bad" in texts(scene) or "/glow" in texts(scene))
     mi.load_dict(scene)
 
 
@@ -313,6 +346,19 @@ def test_deep_stage(usd, tmp_path):
     stage = Usd.Stage.CreateNew(path)
     UsdGeom.Xform.Define(stage, "/" + "/".join(["a"] * 400))
     UsdLux.SphereLight.Define(stage, "/" + "/".join(["a"] * 400) + "/light")
+    stage.Save()
+    assert len(mi.load_dict(usd.load(path)).emitters()) == 1
+
+
+def test_deep_instance(usd, tmp_path):
+    """Deeper than Python's functions may call each other."""
+    path, place = str(tmp_path / "deep.usda"), "/" + "/".join(["a"] * 1200)
+    stage = Usd.Stage.CreateNew(path)
+    stage.CreateClassPrim("/lamp")
+    UsdLux.SphereLight.Define(stage, "/lamp/light")
+    instance = UsdGeom.Xform.Define(stage, place).GetPrim()
+    instance.GetReferences().AddInternalReference("/lamp")
+    instance.SetInstanceable(True)
     stage.Save()
     assert len(mi.load_dict(usd.load(path)).emitters()) == 1
 

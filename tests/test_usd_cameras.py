@@ -176,6 +176,12 @@ def test_stage_without_camera_is_framed(load, axis):
     assert up["XYZ".index(axis)] > 0.5
 
 
+def test_clipping_planes_are_noted(load):
+    scene = load(LIGHT + camera("float4[] clippingPlanes = [(0, 0, 1, 5)];"))
+    assert "/camera" in note(scene, "clippingPlanes")
+    assert not note(load(LIGHT + camera()), "clippingPlanes")
+
+
 @pytest.mark.parametrize("attribute", ["focalLength", "horizontalAperture", "verticalAperture"])
 @pytest.mark.parametrize("value", ["0", "-1", "nan"])
 def test_broken_cameras_are_noted(load, attribute, value):
@@ -213,6 +219,46 @@ def test_several_settings_need_the_stage_to_choose(load):
     assert scene["sensor"]["film"]["width"] == 24
     scene = load(LIGHT + camera() + two, {"renderSettingsPrimPath": "/c"})
     assert "/c" in note(scene, "settings")
+
+
+def test_a_product_is_stronger_than_its_settings(load):
+    """What it has no opinion about is that of the settings."""
+    product = 'def RenderProduct "NAME" {;rel camera = </NAME_camera>;int2 resolution = (24, 8);};'
+    products = product.replace("NAME", "p") + product.replace("NAME", "q")
+    settings = """def RenderSettings "s" { ; rel camera = </camera>; int2 resolution = (32, 16)
+        token aspectRatioConformPolicy = "cropAperture"; rel products = PRODUCTS };"""
+    text = LIGHT + "".join(camera(name=name) for name in ("camera", "q_camera", "p_camera"))
+    text += products + settings
+    scene = load(text.replace("PRODUCTS", "</p>"))
+    assert scene.camera == "/p_camera"
+    assert scene["sensor"]["film"]["width"] == 24
+    assert scene["sensor"]["fov"] == pytest.approx(np.degrees(2 * np.arctan(20.955 / 100)))
+    assert not note(scene, "products")
+    scene = load(text.replace("PRODUCTS", "[</q>, </p>]"))
+    assert scene.camera == "/q_camera" and "/q" in note(scene, "products")
+    assert load(text.replace("PRODUCTS", "[</none>, </camera>]")).camera == "/camera"
+
+
+def test_settings_that_disable_depth_of_field(load):
+    lens = "float fStop = 2;float focusDistance = 7;float horizontalApertureOffset = 2;"
+    settings = 'def RenderSettings "s" {;bool disableDepthOfField = 1;}'
+    sensor = load(LIGHT + camera(lens) + settings)["sensor"]
+    assert sensor["type"] == "perspective" and "principal_point_offset_x" in sensor
+    sensor = load(LIGHT + camera(lens) + settings.replace("= 1", "= 0"))["sensor"]
+    assert sensor["type"] == "thinlens"
+
+
+@pytest.mark.parametrize("purposes", [("default", "render"), ("render", "default")])
+def test_purposes_of_settings_are_noted_where_others_are_read(load, purposes):
+    settings = 'def RenderSettings "s" {;uniform token[] includedPurposes = ["default", "render"];}'
+    scene = load(LIGHT + camera() + settings, purposes=purposes)
+    assert not note(scene, "includedPurposes")
+    scene = load(LIGHT + camera() + settings, purposes=("default",))
+    assert "default, render" in note(scene, "includedPurposes")
+    scene = load(
+        LIGHT + camera() + settings.replace("token[]", "int").replace('["default", "render"]', "3")
+    )
+    assert not note(scene, "includedPurposes")
 
 
 @pytest.mark.parametrize("value", ["(0, 5)", "(-3, 5)", "(1000000, 1)"])

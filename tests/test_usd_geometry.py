@@ -255,6 +255,29 @@ def test_overlapping_subsets_keep_the_first_and_say_so():
     assert [s.face_of.tolist() for s in surfaces] == [[0, 0, 1, 1]]
 
 
+def test_subsets_of_points_have_no_material_of_their_own():
+    text = mesh(TWO_SQUARES + subset("s", [1]).replace('"face"', '"point"'))
+    surfaces, notes = read(text)
+    assert [str(s.binding.GetPath()) for s in surfaces] == ["/a"]
+    assert "/a/s" in notes[0].text and "type point" in notes[0].text
+
+
+@pytest.mark.parametrize("kind", ["texCoord3f", "texCoord3h", "texCoord3d"])
+def test_texture_coordinates_of_three_numbers_lose_the_last(kind):
+    values = f"{kind}[] primvars:uv = [(0, 1, 7), (1, 1, 7), (1, 0, 7), (0, 0, 7)] ("
+    surface = only(mesh(SQUARE + values + '\ninterpolation = "vertex"\n)'))
+    assert surface.uv_sets["uv"].tolist() == [[0, 1], [1, 1], [1, 0], [0, 0]]
+
+
+def test_colors_of_four_numbers_lose_the_last_and_of_two_are_noted():
+    surface = only(mesh(SQUARE + "color4f[] primvars:displayColor = [(1, 0, 0.5, 1)]"))
+    assert (surface.colors == [1, 0, 0.5]).all()
+    surfaces, notes = read(mesh(SQUARE + "float2[] primvars:displayColor = [(1, 0)]"))
+    assert surfaces[0].colors is None
+    assert "/a.primvars:displayColor" in notes[0].text and "3 numbers" in notes[0].text
+    assert not read(mesh(SQUARE + "color4f[] primvars:displayColor = []"))[1]
+
+
 # --- broken meshes ---
 
 
@@ -553,9 +576,11 @@ def test_tetrahedra_show_their_outside():
     assert volume(surface) == pytest.approx(1 / 6)
 
 
-def test_types_that_are_left_out_are_noted():
-    surfaces, notes = read('def NurbsPatch "a" {\n}')
-    assert not surfaces and notes[0].kind == "NurbsPatch"
+@pytest.mark.parametrize("kind", ["NurbsPatch", "Volume", "ParticleField3DGaussianSplat"])
+def test_types_that_are_left_out_are_noted(kind):
+    surfaces, notes = read(f'def {kind} "a" {{\n}}')
+    assert not surfaces
+    assert f"prims of type {kind} are left out" in notes[0].text and "/a" in notes[0].text
     assert corners(only('def Cube "a" {}')).shape == (12, 3, 3)
 
 

@@ -567,6 +567,13 @@ def test_geometry_light_makes_its_geometry_shine(load):
     assert "/none" in note(load(light.replace("/quad", "/none")), "geometry light")
 
 
+def test_geometry_of_several_lights_is_noted(load):
+    light = 'def GeometryLight "NAME" {;rel geometry = </quad>;float inputs:intensity = 6;}'
+    lights = light.replace("NAME", "a") + light.replace("NAME", "b")
+    scene = load(f'{lights};def Mesh "quad" {{;{QUAD}{placed()}}}')
+    assert "/quad" in note(scene, "geometry light") and "/b" in note(scene, "geometry light")
+
+
 # -- What cannot be carried over
 
 

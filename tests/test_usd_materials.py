@@ -623,6 +623,49 @@ def test_readers_of_display_color_in_a_material():
     assert kinds(notes) == ["primvar reader"]
 
 
+COLOR_READER = """def Shader "c" {
+    uniform token info:id = "UsdPrimvarReader_float3"
+    string inputs:varname = "Col"
+    float3 inputs:fallback = (.1, .2, .3)
+    float3 outputs:result
+}"""
+
+
+def seen_colors(folder, text):
+    """Return the reflectance at four places of the square."""
+    from manylights import usd
+
+    path = folder / "colors.usda"
+    path.write_text("#usda 1.0\n" + text)
+    description = usd.load(path)
+    scene, found = mi.load_dict(description), []
+    for x, y in ((-0.9, -0.8), (0.8, -0.9), (0.9, 0.8), (-0.8, 0.9)):
+        si = scene.ray_intersect(mi.Ray3f([x, y, 5.0], [0, 0, -1]))
+        found.append(np.ravel(si.bsdf().eval_diffuse_reflectance(si)))
+    return np.array(found), description.notes
+
+
+@pytest.mark.parametrize("interpolation", ["faceVarying", "vertex", "uniform"])
+def test_a_material_may_read_any_color_of_its_mesh(tmp_path, interpolation):
+    """As Blender writes color attributes; displayColor is another one."""
+    text = preview("color3f inputs:diffuseColor.connect = </m/c.outputs:result>", COLOR_READER)
+    corners = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0)], dtype=float)
+    values = corners[:1] if interpolation == "uniform" else corners
+    listed = ", ".join(str(tuple(value.tolist())) for value in values)
+    body = f'color3f[] primvars:Col = [{listed}] (\ninterpolation = "{interpolation}"\n)\n'
+    body += "color3f[] primvars:displayColor = [(.5, .5, .5)]\n"
+    found, notes = seen_colors(tmp_path, square(BOUND + body) + text)
+    expected = corners[:1] if interpolation == "uniform" else corners
+    assert np.allclose(found, expected, atol=0.2)
+    assert "primvar reader" not in kinds(notes)
+
+
+def test_a_color_that_the_mesh_does_not_have_is_noted(tmp_path):
+    text = preview("color3f inputs:diffuseColor.connect = </m/c.outputs:result>", COLOR_READER)
+    found, notes = seen_colors(tmp_path, square(BOUND) + text)
+    assert np.allclose(found, [0.1, 0.2, 0.3]) and "primvar reader" in kinds(notes)
+
+
 # --- bindings ---
 
 
@@ -760,6 +803,25 @@ def test_standard_surface():
     assert material.emission["value"] == pytest.approx([3, 6, 0])
     assert material.bsdf["type"] == "mask" and material.bsdf["opacity"] == pytest.approx(0.5)
     assert not notes
+
+
+@pytest.mark.parametrize(
+    "node, weight, index",
+    [
+        ("ND_standard_surface_surfaceshader", "specular", "specular_IOR"),
+        ("ND_open_pbr_surface_surfaceshader", "specular_weight", "specular_ior"),
+    ],
+)
+@pytest.mark.parametrize("share", [0.0, 0.25, 2.0])
+def test_specular_weight_scales_the_reflectance_at_normal_incidence(node, weight, index, share):
+    inputs = f"float inputs:{weight} = {share}\nfloat inputs:{index} = 1.6"
+    material, notes = material_of(square() + mtlx(node, inputs))
+    eta = principled(material)["eta"]
+    reflectance = share * (0.6 / 2.6) ** 2
+    assert ((eta - 1) / (eta + 1)) ** 2 == pytest.approx(reflectance, abs=1e-7)
+    assert not notes
+    _, notes = material_of(square() + mtlx(node, "color3f inputs:specular_color = (1, .5, 1)"))
+    assert "specular_color" in notes[0].text
 
 
 def test_open_pbr_surface_and_its_fallbacks():

@@ -74,3 +74,20 @@ def test_stages_without_skeletons_are_not_written_to():
     context = context_of(stage_of('def Cube "a" {}'))
     bake(context)
     assert context.stage.GetSessionLayer().empty
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("jointWeights = [1, 1, 1]", "jointWeights = [1, 1]"),
+        ("jointIndices = [0, 0, 0]", "jointIndices = [0, 7, 0]"),
+        ("Transforms = [((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,1))]", "Transforms = []"),
+    ],
+)
+def test_characters_that_cannot_be_skinned_are_noted(old, new):
+    """USD only warns of them; their points are those at rest."""
+    assert old in CHARACTER
+    context = context_of(stage_of(CHARACTER.replace(old, new)), 11)
+    bake(context)
+    assert [note.kind for note in context.notes] == ["skinning"]
+    assert "/character/r" in context.notes[0].text and "rest pose" in context.notes[0].text

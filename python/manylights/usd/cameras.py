@@ -74,6 +74,9 @@ def sensor_of(prim: Usd.Prim, context: Context, settings: RenderSettings) -> tup
     """Return a camera as a sensor and the factor of its exposure."""
     camera = UsdGeom.Camera(prim)
     values = _Values(camera, context)
+    if len(context.value(camera.GetClippingPlanesAttr(), ())):
+        text = "the clippingPlanes of a camera were ignored, it sees what they cut away"
+        context.notes.add("clippingPlanes", text, prim)
     width, height = _resolution(settings, values.aspect())
     horizontal, vertical = settings.conform(values.horizontal, values.vertical, width / height)
     frame, position = _frame(prim, context)
@@ -94,7 +97,8 @@ def sensor_of(prim: Usd.Prim, context: Context, settings: RenderSettings) -> tup
         if offset_x or offset_y:
             sensor["principal_point_offset_x"] = offset_x / horizontal
             sensor["principal_point_offset_y"] = -offset_y / vertical
-        values.add_lens(sensor)
+        if settings.has_lens():
+            values.add_lens(sensor)
     sensor.update(_film_and_sampler(width, height, settings))
     settings.apply_to_sensor(prim, sensor)
     return sensor, values.exposure()

@@ -58,6 +58,7 @@ class Context:
         legacy_lights: read the inputs of lights from before USD 21.05?
         blender_light_units: are lights as Blender exports them?
         light_groups: which lights may become one.
+        color_primvar: what colors of surfaces are read from.
     """
 
     stage: Usd.Stage
@@ -68,6 +69,7 @@ class Context:
     legacy_lights: bool = False
     blender_light_units: bool = False
     light_groups: LightGroups = field(default_factory=LightGroups)
+    color_primvar: str = "displayColor"
 
     def value(self, attribute, fallback=None):
         """Return an attribute's value, ``fallback`` if it has none or is blocked.

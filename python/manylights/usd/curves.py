@@ -59,7 +59,7 @@ def surfaces_of_curves(prim, context) -> list[Surface]:
     curves = UsdGeom.BasisCurves(prim)
     points = primvars.as_rows(context.value(curves.GetPointsAttr(), []), 3)
     points = np.zeros((0, 3)) if points is None else points
-    counts = np.asarray(context.value(curves.GetCurveVertexCountsAttr(), []), dtype=np.int64)
+    counts = primvars.integers(context.value(curves.GetCurveVertexCountsAttr()))
     if not len(counts) or counts.sum() != len(points) or counts.min() < 0:
         shown = f"curveVertexCounts adds up to {counts.sum()}, there are {len(points)} points"
         context.notes.add("broken curves", f"curves are left out: {shown}", prim)

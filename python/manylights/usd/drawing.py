@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 from pxr import Tf, Usd, UsdLux
 
-from manylights.usd.context import Context
+from manylights.usd.context import Context, Notes
 from manylights.usd.copies import copies
 from manylights.usd.description import transformed
 from manylights.usd.geometry import surfaces_of
@@ -74,16 +75,17 @@ class Scenery:
 
     def _add_shining(self, batch: Batch, item: Item) -> list[tuple[Item, Surface, object]]:
         """Add the surfaces of a prim that shine, return the others with their materials."""
-        surfaces = surfaces_of(item.prim, self.context)
-        surfaces = [surface for surface in surfaces if len(surface.faces)]
+        surfaces, bound = self._surfaces(item.prim)
         if not surfaces:
             return []
+        if batch.color is not None:
+            _give_color(surfaces, batch.color)
         worlds = batch.worlds(item)
         self._corners += [_box(surface.positions, worlds) for surface in surfaces]
         light = self._light(item.prim)
         quiet, shining = [], []
-        for surface in surfaces:
-            material = self.materials.of(surface)
+        for surface, material in zip(surfaces, bound):
+            material = self.materials.make(material, surface)
             surface.uv = checked_uv(surface, material, self.context)
             glow = light.glow(surface, material) if light else glow_of(surface, material)
             if glow is None or not glow.radiance.any():
@@ -93,6 +95,19 @@ class Scenery:
         if shining:
             self._shine(batch, item, surfaces, shining)
         return quiet
+
+    def _surfaces(self, prim: Usd.Prim) -> tuple[list[Surface], list]:
+        """Return the surfaces of a prim with the colors that their materials ask for, and these."""
+        surfaces = [part for part in surfaces_of(prim, self.context) if len(part.faces)]
+        bound = [self.materials.bound(part.binding) for part in surfaces]
+        names = {name for name in map(self.materials.color_primvar, bound) if name}
+        if names - {"displayColor"}:
+            name = min(names - {"displayColor"})
+            context = replace(self.context, color_primvar=name, notes=Notes())
+            colored = [part for part in surfaces_of(prim, context) if len(part.faces)]
+            if any(part.colors is not None for part in colored):
+                surfaces = [replace(part, color_primvar=name) for part in colored]
+        return surfaces, bound
 
     def _light(self, prim: Usd.Prim) -> MeshLight | None:
         """Return the light that a geometry is."""
@@ -159,12 +174,23 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
             if item.prim.GetTypeName() == "GeometryLight":
                 relation = item.prim.GetRelationship("geometry")
                 for target in relation.GetForwardedTargets() if relation else ():
+                    if result.get(target, item.prim) != item.prim:
+                        text = f"{target} is the geometry of several lights: it has the last one's"
+                        context.notes.add("geometry light", text, item.prim)
                     result[target] = item.prim
     for target, prim in result.items():
         if target not in drawn:
             text = f"a GeometryLight points to {target}, which is not drawn"
             context.notes.add("geometry light", text, prim)
     return result
+
+
+def _give_color(surfaces: list[Surface], color: np.ndarray) -> None:
+    """Set the displayColor of surfaces that have none."""
+    for surface in surfaces:
+        if surface.colors is None and surface.color_primvar == "displayColor":
+            surface.colors = np.tile(np.float32(color), (len(surface.faces), 1))
+            surface.colors_per = "face"
 
 
 def _box(positions: np.ndarray, matrices: np.ndarray) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pxr import UsdGeom
+
 from manylights.usd.curves import surfaces_of_curves
 from manylights.usd.gprims import SHAPES, surfaces_of_gprim, surfaces_of_points
 from manylights.usd.meshes import surfaces_of_mesh
@@ -16,19 +18,16 @@ READERS = {
     **dict.fromkeys(SHAPES, surfaces_of_gprim),
 }
 
-NOT_CARRIED = ("NurbsPatch", "NurbsCurves", "HermiteCurves", "Volume")
-"""Types that draw something and that are left out, with a note."""
-
 
 def surfaces_of(prim, context) -> list[Surface]:
     """Return the surfaces of a prim, in its own space: one for each material it is bound to.
 
-    Prims of other types, and broken ones, have none; the latter are noted.
+    Broken prims, and geometry of other types, have none and are noted.
     """
     kind = str(prim.GetTypeName())
     reader = READERS.get(kind)
     if reader is not None:
         return reader(prim, context)
-    if kind in NOT_CARRIED:
+    if prim.IsA(UsdGeom.Gprim):
         context.notes.add(kind, f"prims of type {kind} are left out", prim)
     return []

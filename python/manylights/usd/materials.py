@@ -66,11 +66,16 @@ class Materials:
 
     def of(self, surface) -> Material:
         """Return the material of a surface, that of its colors where none is bound."""
-        return self._make(self.bound(surface.binding), surface)
+        return self.make(self.bound(surface.binding), surface)
 
     def bsdf(self, prim) -> Material:
         """Return the material that a prim is bound to, grey if there is none."""
-        return self._make(self.bound(prim), None)
+        return self.make(self.bound(prim), None)
+
+    def color_primvar(self, material) -> str | None:
+        """Return the primvar that the colors of a USD material are, ``None`` if there is none."""
+        found = self._found(material) if material else None
+        return found.color_primvar() if isinstance(found, Look) else None
 
     def bound(self, prim):
         """Return the material of a prim: for full renders, for previews, else for all purposes."""
@@ -84,27 +89,35 @@ class Materials:
             self.context.notes.add("missing material", text, prim)
         return material or None
 
-    def _make(self, material, surface) -> Material:
+    def make(self, material, surface) -> Material:
+        """Return what Mitsuba makes of a material of USD, or of none, on a surface."""
         found = self._look(material) if material else None
         if found is None:
-            return self._of_colors(surface)
+            own = surface is None or surface.color_primvar == "displayColor"
+            return self._of_colors(surface if own else None)
         if isinstance(found, Material):
             return found
-        key = (str(material.GetPath()), *(_rates(surface) if found.uses_primvars() else ()))
+        key: tuple = (str(material.GetPath()),)
+        if found.uses_primvars():
+            key += (*_rates(surface), surface and surface.color_primvar)
         if key not in self._made:
             self._made[key] = self._of_look(with_own_lookups(found), material.GetPrim(), surface)
         return self._made[key]
 
     def _look(self, material):
         """Return the look of a material, a ``Material`` of Mitsuba's own, or ``None``."""
-        path = str(material.GetPath())
-        if path not in self._looks:
-            self._looks[path] = self._read(material)
-        found = self._looks[path]
+        found = self._found(material)
         if isinstance(found, str):
             self.context.notes.add(*_PROBLEMS.get(found, (found, _OTHERS.format(found))), material)
             return None
         return found
+
+    def _found(self, material):
+        """Return what ``_read`` does, read once."""
+        path = str(material.GetPath())
+        if path not in self._looks:
+            self._looks[path] = self._read(material)
+        return self._looks[path]
 
     def _read(self, material):
         """Return a look, a ``Material``, or a word that says why there is neither."""

@@ -131,6 +131,15 @@ class _Inputs:
             return fallback
         return found
 
+    def ior(self, name: str, weight: str) -> float:
+        """Return the index of refraction whose reflectance is that of ``name`` times a weight."""
+        index = self.number(name, 1.5)
+        weight = max(self.number(weight, 1.0), 0.0)
+        if weight == 1.0:
+            return index
+        root = min(abs(index - 1) / (index + 1) * np.sqrt(weight), 0.99)
+        return float((1 + root) / (1 - root))
+
 
 def standard_surface(shader, context) -> Look:
     """Read an ND_standard_surface_surfaceshader."""
@@ -140,7 +149,7 @@ def standard_surface(shader, context) -> Look:
         base_weight=inputs.number("base", 1.0),
         metallic=inputs.any("metalness", 0.0),
         roughness=inputs.any("specular_roughness", 0.2),
-        ior=inputs.number("specular_IOR", 1.5),
+        ior=inputs.ior("specular_IOR", "specular"),
         clearcoat=inputs.any("coat", 0.0),
         clearcoat_roughness=inputs.any("coat_roughness", 0.1),
         opacity=inputs.any("opacity", 1.0),
@@ -150,6 +159,7 @@ def standard_surface(shader, context) -> Look:
         normal=evaluate(shader.GetInput("normal"), context),
     )
     _note_rest(inputs, ("transmission", "subsurface", "sheen", "thin_film_thickness"))
+    _note_rest(inputs, ("specular_color", "coat_color"), plain=1.0)
     return look
 
 
@@ -161,7 +171,7 @@ def open_pbr(shader, context) -> Look:
         base_weight=inputs.number("base_weight", 1.0),
         metallic=inputs.any("base_metalness", 0.0),
         roughness=inputs.any("specular_roughness", 0.3),
-        ior=inputs.number("specular_ior", 1.5),
+        ior=inputs.ior("specular_ior", "specular_weight"),
         clearcoat=inputs.any("coat_weight", 0.0),
         clearcoat_roughness=inputs.any("coat_roughness", 0.0),
         opacity=inputs.any("geometry_opacity", 1.0),
@@ -171,6 +181,7 @@ def open_pbr(shader, context) -> Look:
         normal=evaluate(shader.GetInput("geometry_normal"), context),
     )
     _note_rest(inputs, ("transmission_weight", "subsurface_weight", "fuzz_weight"))
+    _note_rest(inputs, ("specular_color", "coat_color"), plain=1.0)
     return look
 
 
@@ -187,9 +198,10 @@ def surface_unlit(shader, context) -> Look:
     )
 
 
-def _note_rest(inputs: _Inputs, names) -> None:
+def _note_rest(inputs: _Inputs, names, plain: float = 0.0) -> None:
+    """Note inputs that are not used and have another value than the one that changes nothing."""
     for name in names:
-        value = inputs.any(name, 0.0)
-        if isinstance(value, Lookup) or np.any(np.asarray(value) != 0):
+        value = inputs.any(name, (plain,) * 3 if plain else plain)
+        if isinstance(value, (Lookup, Attribute)) or np.any(np.asarray(value) != plain):
             text = f"the input {name} of surfaces is not used"
             inputs.context.notes.add(f"input {name}", text, inputs.shader)

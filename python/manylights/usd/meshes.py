@@ -73,8 +73,8 @@ def polygons_of(prim, points, counts, indices, context) -> Polygons | None:
     if points is None or not len(points):
         context.notes.add("empty mesh", "a mesh without points is left out", prim)
         return None
-    counts = np.asarray(counts if counts is not None else [], dtype=np.int64).ravel()
-    indices = np.asarray(indices if indices is not None else [], dtype=np.int64).ravel()
+    counts = primvars.integers(counts)
+    indices = primvars.integers(indices)
     problem = _problem(points, counts, indices)
     if problem:
         kind = "empty mesh" if not len(counts) else "broken mesh"
@@ -221,6 +221,11 @@ def _split(whole: Surface, prim, face_count: int, context) -> list[Surface]:
         return [whole]
     owner = np.full(face_count, -1)
     for number, subset in enumerate(subsets):
+        element = context.value(subset.GetElementTypeAttr(), "face")
+        if element != "face":
+            text = f"the material of a subset of elements of the type {element} is left out"
+            context.notes.add("subset type", text, subset.GetPrim())
+            continue
         faces = context.value(subset.GetIndicesAttr())
         faces = _indices(faces, face_count, subset.GetPrim(), context)
         if (owner[faces] >= 0).any():
@@ -241,7 +246,7 @@ def _indices(value, count: int, prim, context) -> np.ndarray:
     """Return indices of faces, those out of range left out with a note."""
     if value is None or not len(value):
         return np.zeros(0, dtype=np.int64)
-    faces = np.asarray(value, dtype=np.int64).ravel()
+    faces = primvars.integers(value)
     inside = (faces >= 0) & (faces < count)
     if not inside.all():
         text = f"indices of faces that are not in 0..{count - 1} are left out"

@@ -66,18 +66,36 @@ def as_rows(value, width: int) -> np.ndarray | None:
     return array if array.ndim == 2 and array.shape[1] == width else None
 
 
+def integers(value) -> np.ndarray:
+    """Return an array of whole numbers as ``(n,)`` int64, an empty one for ``None``.
+
+    Raises:
+        ValueError: they are of another type.
+    """
+    array = np.asarray(value if value is not None else [])
+    if array.size and array.dtype.kind not in "iu":
+        shown = " ".join(str(value).split())[:60]
+        raise ValueError(f"{shown} is no array of whole numbers")
+    return array.astype(np.int64).ravel()
+
+
 def read_primvar(primvar, width: int, sizes: Sizes, context) -> Values | None:
     """Read a ``UsdGeom.Primvar``, ``None`` and a note if it does not fit its prim."""
     if not primvar:
         return None
     value = context.value(primvar.GetAttr())
     rows = None if value is None else as_rows(value, width)
+    if rows is None and width == 3 and (four := as_rows(value, 4)) is not None:
+        rows = four[:, :3]  # colors with alpha
+    if rows is None and value is not None and np.size(value):
+        text = f"values that are not {width} numbers each are not used"
+        context.notes.add("primvar type", text, primvar.GetAttr().GetPath())
     if rows is None or not len(rows):
         return None
     indices = context.value(primvar.GetIndicesAttr()) if primvar.IsIndexed() else None
     where = f"{primvar.GetAttr().GetPath()}"
     if indices is not None and len(indices):
-        rows = _indexed(rows, np.asarray(indices), where, context.notes)
+        rows = _indexed(rows, integers(indices), where, context.notes)
     return fitting(rows, primvar.GetInterpolation(), sizes, where, context.notes)
 
 
@@ -111,9 +129,12 @@ def texture_coordinates(prim, sizes: Sizes, context) -> dict[str, Values]:
     """Return all texture coordinates of a prim by name, ``st`` first if there is one."""
     found = {}
     for primvar in UsdGeom.PrimvarsAPI(prim).FindPrimvarsWithInheritance():
-        if primvar.GetTypeName().scalarType.cppTypeName in ("GfVec2f", "GfVec2d", "GfVec2h"):
-            values = read_primvar(primvar, 2, sizes, context)
+        kind = primvar.GetTypeName()
+        in_plane = kind.scalarType.cppTypeName in ("GfVec2f", "GfVec2d", "GfVec2h")
+        if in_plane or kind.role == "TextureCoordinate":
+            values = read_primvar(primvar, 2 if in_plane else 3, sizes, context)
             if values is not None:
+                values.array = values.array[:, :2]
                 found[primvar.GetPrimvarName()] = finite(values, primvar, context.notes)
     return dict(sorted(found.items(), key=lambda item: (item[0] != "st", item[0])))
 
@@ -130,9 +151,9 @@ def finite(values: Values, primvar, notes) -> Values:
 
 
 def display_color(prim, sizes: Sizes, context) -> tuple[Values | None, Values | None]:
-    """Return displayColor and displayOpacity, clamped to 0..1."""
+    """Return displayColor, or what the context has in its place, and displayOpacity, in 0..1."""
     result = []
-    for name, width in (("displayColor", 3), ("displayOpacity", 1)):
+    for name, width in ((context.color_primvar, 3), ("displayOpacity", 1)):
         primvar = find(prim, name)
         values = read_primvar(primvar, width, sizes, context)
         if values is not None:

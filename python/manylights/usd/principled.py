@@ -58,6 +58,11 @@ class Look:
         """Return the images."""
         return [part for part in self.parts() if isinstance(part, Lookup)]
 
+    def color_primvar(self) -> str | None:
+        """Return the primvar that a color is, ``None`` if there is none."""
+        colors = [part for part in (self.base_color, self.emission) if isinstance(part, Attribute)]
+        return colors[0].primvar if colors else None
+
     def uses_primvars(self) -> bool:
         """Does the look depend on the mesh's colors?"""
         return any(isinstance(part, Attribute) for part in self.parts())
@@ -69,6 +74,11 @@ def is_white(texture) -> bool:
         return False
     pixels = np.array(texture["bitmap"])
     return bool((pixels == (np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)).all())
+
+
+def _primvar_of(surface, rows: str) -> str:
+    """Return the primvar that the colors or the opacity of a surface were read from."""
+    return surface.color_primvar if rows == "colors" else "displayOpacity"
 
 
 class Principled:
@@ -148,8 +158,8 @@ class Principled:
 
     def _attribute(self, part: Attribute, rows: str, name: str):
         """Return the colors of the mesh, the fallback if it has none."""
-        authored = {"colors": "displayColor", "opacity": "displayOpacity"}[rows]
-        if part.primvar == authored and getattr(self.surface, rows) is not None:
+        found = getattr(self.surface, rows, None)
+        if found is not None and part.primvar == _primvar_of(self.surface, rows):
             per = getattr(self.surface, f"{rows}_per")
             return {"type": "mesh_attribute", "name": f"{per}_{name}"}
         text = f"the primvar {part.primvar} is not read here, its fallback value is used"

@@ -202,7 +202,7 @@ def _add_sensor(
             scene["sensor"], scene.exposure = cameras.sensor_of(prim, context, settings)
     except StageError:
         raise
-    except (TypeError, ValueError) as error:
+    except (IndexError, OverflowError, TypeError, ValueError) as error:
         places = [str(part.GetPath()) for part in (prim, settings.prim) if part]
         text = f"{' or '.join(places)}: an attribute of the wrong type: {one_line(error)}"
         raise StageError(text) from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pxr import Sdf, Usd, UsdRender
+from pxr import Sdf, Usd, UsdRender, Vt
 
 from manylights.usd.context import Context
 
@@ -20,11 +20,14 @@ class RenderSettings:
 
     Attributes:
         prim: a ``RenderSettings`` prim, None if there is none.
+        product: its first ``RenderProduct``, which is stronger, None if there is none.
     """
 
     def __init__(self, context: Context) -> None:
         self.context = context
         self.prim = self._find()
+        self.product = self._first_product()
+        self._note_purposes()
 
     def _find(self) -> Usd.Prim | None:
         stage = self.context.stage
@@ -43,18 +46,41 @@ class RenderSettings:
             self.context.notes.add("settings", text, found[0])
         return found[0] if len(found) == 1 else None
 
+    def _first_product(self) -> Usd.Prim | None:
+        """Return the product whose image is rendered, note others with another camera."""
+        relation = self.prim.GetRelationship("products") if self.prim else None
+        targets = relation.GetForwardedTargets() if relation else ()
+        prims = [self.context.stage.GetPrimAtPath(path) for path in targets]
+        products = [prim for prim in prims if prim and prim.IsA(UsdRender.Product)]
+        if len({_camera_of(product) for product in products}) > 1:
+            path = products[0].GetPath()
+            text = f"the RenderSettings have products of several cameras, used was {path}"
+            self.context.notes.add("products", text, self.prim)
+        return products[0] if products else None
+
+    def _note_purposes(self) -> None:
+        included, used = self._value("includedPurposes"), self.context.purposes
+        if isinstance(included, Vt.TokenArray) and {*included} != {*used}:
+            text = f"includedPurposes {', '.join(included)} of the RenderSettings were ignored, "
+            text += f"used were {', '.join(used)}: the argument purposes chooses them"
+            self.context.notes.add("includedPurposes", text, self.prim)
+
     def _value(self, name: str, fallback=None):
-        """Return an authored attribute."""
-        attribute = self.prim.GetAttribute(name) if self.prim else None
-        if not attribute or not attribute.HasAuthoredValue():
-            return fallback
-        return self.context.value(attribute, fallback)
+        """Return an authored attribute of the product or the settings."""
+        for prim in (self.product, self.prim):
+            attribute = prim.GetAttribute(name) if prim else None
+            if attribute and attribute.HasAuthoredValue():
+                return self.context.value(attribute, fallback)
+        return fallback
 
     def camera(self) -> Sdf.Path | None:
         """Return the path of the camera."""
-        relation = self.prim.GetRelationship("camera") if self.prim else None
-        targets = relation.GetForwardedTargets() if relation else ()
-        return targets[0] if targets else None
+        found = [_camera_of(prim) for prim in (self.product, self.prim) if prim]
+        return next(filter(None, found), None)
+
+    def has_lens(self) -> bool:
+        """May cameras have depth of field?"""
+        return not self._value("disableDepthOfField", False)
 
     def resolution(self) -> tuple[int, int] | None:
         """Return width and height in pixels, if they are authored."""
@@ -140,6 +166,13 @@ class RenderSettings:
         return result
 
 
+def _camera_of(prim: Usd.Prim) -> Sdf.Path | None:
+    """Return the path of the camera of settings or a product."""
+    relation = prim.GetRelationship("camera")
+    targets = relation.GetForwardedTargets() if relation else ()
+    return targets[0] if targets else None
+
+
 def _plain(value):
     """Return a value of USD as Mitsuba takes it."""
     if isinstance(value, (bool, int, float, str)):
@@ -148,5 +181,5 @@ def _plain(value):
         return value.resolvedPath or value.path
     try:
         return [float(part) for part in value]
-    except TypeError:
+    except (TypeError, ValueError):
         return str(value)

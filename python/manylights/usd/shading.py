@@ -74,7 +74,8 @@ def shader_id(shader) -> str:
         return (
             f"{kind}:{shader.GetSourceAssetSubIdentifier(kind) or shader.GetSourceAsset(kind).path}"
         )
-    return shader.GetIdAttr().Get() or ""
+    authored = shader.GetIdAttr().Get()
+    return authored if isinstance(authored, str) else ""
 
 
 def producer(connectable):

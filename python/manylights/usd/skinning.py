@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pxr import Gf, Tf, Usd, UsdSkel
+from pxr import Gf, Tf, Usd, UsdSkel, UsdUtils
 
 ANIMATED = ("translations", "rotations", "scales", "blendShapeWeights")
 """Attributes of an animation that move points."""
@@ -30,14 +30,25 @@ def bake(context) -> None:
         for prim in roots:
             if not prim.IsA(UsdSkel.Root):
                 continue  # baked with the prim that it refers to
-            try:
-                whole = UsdSkel.BakeSkinning(UsdSkel.Root(prim), moment)
-                reason = "" if whole else "its skinning is not whole"
-            except Tf.ErrorException as error:
-                reason = " ".join(str(error).split())[:200]
+            reason = _bake(UsdSkel.Root(prim), moment)
             if reason:
-                text = f"a skinned character stays in its rest pose: {reason}"
+                text = f"a skinned character stays, at least in part, in its rest pose: {reason}"
                 context.notes.add("skinning", text, prim)
+
+
+def _bake(root: UsdSkel.Root, moment: Gf.Interval) -> str:
+    """Bake the skinning of one character; return what went wrong, empty if nothing did."""
+    # Broken weights and joints are warnings only
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        whole = UsdSkel.BakeSkinning(root, moment)
+    except Tf.ErrorException as error:
+        return " ".join(str(error).split())[:200]
+    finally:
+        warnings = [each.commentary for each in delegate.TakeUncoalescedDiagnostics()]
+    if warnings:
+        return warnings[-1]
+    return "" if whole else "its skinning is not whole"
 
 
 def _skinned(stage) -> list:

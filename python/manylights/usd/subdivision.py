@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from manylights.usd.primvars import Values
+from manylights.usd.primvars import Values, integers
 from manylights.usd.refinement import Cage, Level
 
 MOST_FACES = 4_000_000
@@ -16,17 +16,19 @@ MOST_FACES = 4_000_000
 def cage_of(mesh, scheme: str, context) -> Cage:
     """Read creases and corners; those that do not fit the mesh are noted and left out."""
 
-    def array(attribute, kind):
-        value = context.value(attribute)
-        return np.asarray(value if value is not None else [], dtype=kind)
+    def whole(attribute):
+        return integers(context.value(attribute))
+
+    def real(attribute):
+        return np.asarray(context.value(attribute, []), dtype=np.float64)
 
     count = len(context.value(mesh.GetPointsAttr()))
-    lengths = array(mesh.GetCreaseLengthsAttr(), np.int64)
-    points = array(mesh.GetCreaseIndicesAttr(), np.int64)
-    sharpness = array(mesh.GetCreaseSharpnessesAttr(), np.float64)
+    lengths = whole(mesh.GetCreaseLengthsAttr())
+    points = whole(mesh.GetCreaseIndicesAttr())
+    sharpness = real(mesh.GetCreaseSharpnessesAttr())
     corners = np.zeros(count)
-    where = array(mesh.GetCornerIndicesAttr(), np.int64)
-    sharp = array(mesh.GetCornerSharpnessesAttr(), np.float64)
+    where = whole(mesh.GetCornerIndicesAttr())
+    sharp = real(mesh.GetCornerSharpnessesAttr())
     edges = np.zeros((0, 2), dtype=np.int64)
     try:
         corners[where] = sharp

@@ -18,6 +18,7 @@ class Surface:
         normals: ``(n, 3)`` float32, or ``None`` for flat shading.
         uv: ``(n, 2)`` float32 with v as in USD (origin bottom left), or ``None``.
         colors: ``(n, 3)`` (per vertex) or ``(m, 3)`` (per face) float32 displayColor, or ``None``.
+        color_primvar: what ``colors`` were read from.
         opacity: the same of displayOpacity, ``(n, 1)`` or ``(m, 1)``.
         colors_per: ``"vertex"`` or ``"face"``: what ``colors`` has a row for.
         opacity_per: the same of ``opacity``.
@@ -38,6 +39,7 @@ class Surface:
     opacity_per: str = "face"
     double_sided: bool = False
     binding: Any = None
+    color_primvar: str = "displayColor"
     uv_sets: dict[str, np.ndarray] = field(default_factory=dict)
 
     def part(self, chosen: np.ndarray) -> Surface:

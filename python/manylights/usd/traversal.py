@@ -9,6 +9,7 @@ Matrices are those of USD: a point is a row vector, ``p @ M``.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,12 +17,20 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdLux
 
 from manylights.errors import one_line
 from manylights.usd.context import Context
+from manylights.usd.instance_keys import InstanceKeys
+from manylights.usd.primvars import Sizes, display_color, integers
 
 #: More copies than this of one prototype do not fit into memory.
 LARGEST_BATCH = 20_000_000
 
 #: Instancers that instance each other reach this soon, others never.
 MOST_BATCHES = 100_000
+
+#: What is drawn by itself, also in native instances.
+PROXIES = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+
+#: Instancers with more colors than this would become too many groups of instances.
+MOST_COLORS = 256
 
 #: Types that only hold others, and types that others look up.
 CONTAINERS = ("Xform", "Scope", "SkelRoot", "Camera", "Skeleton", "LightFilter")
@@ -51,11 +60,16 @@ class Batch:
         transforms: ``(n, 4, 4)`` to the world.
         items: in the order of the stage.
         instancers: paths of the point instancers that they are in.
+        outer: ``(k, 4, 4)`` of native instances: where ``!resetXformStack!`` leads to, to which
+            every k copies return. ``None``: to the batch.
+        color: that an instancer gives these instances, ``(3,)`` or ``None``.
     """
 
     transforms: np.ndarray
     items: list[Item] = field(default_factory=list)
     instancers: tuple[Sdf.Path, ...] = ()
+    outer: np.ndarray | None = None
+    color: np.ndarray | None = None
 
     def worlds(self, item: Item) -> np.ndarray:
         """Return the transforms of an item to the world, ``(n, 4, 4)``."""
@@ -64,11 +78,15 @@ class Batch:
 
 @dataclass
 class _State:
-    """What prims inherit: transform, purpose, and the instancers that they are in."""
+    """What prims inherit: transform, purpose, and the instancers that they are in.
+
+    Whether a prim's own transform is that to the world is not inherited.
+    """
 
     matrix: np.ndarray
     purpose: str | None = None
     chain: tuple[Sdf.Path, ...] = ()
+    resets: bool = False
 
 
 def collect(context: Context) -> list[Batch]:
@@ -107,16 +125,14 @@ class _Traversal:
         self.batches: list[Batch] = []
         self._waiting: list[tuple] = []
         self._native: dict[tuple, list[tuple[Usd.Prim, _State]]] = {}
-        self._inherited: dict[Sdf.Path, tuple] = {}
         self._roles: dict[tuple, str] = {}
-        self._below: dict[Sdf.Path, list[str]] = {}
+        self._keys = InstanceKeys(context)
 
     def run(self) -> list[Batch]:
         """Return the batches, see :func:`collect`."""
         batch = Batch(np.eye(4)[None])
         root = self.context.stage.GetPseudoRoot()
-        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-        self._walk(root, _State(np.eye(4)), batch, predicate)
+        self._walk(root, _State(np.eye(4)), batch, PROXIES)
         while self._waiting:
             self._walk(*self._waiting.pop())
         return [batch for batch in self.batches if batch.items]
@@ -152,9 +168,11 @@ class _Traversal:
         if self.context.value(imageable.GetVisibilityAttr()) == UsdGeom.Tokens.invisible:
             return None
         state = self._enter(prim, imageable, state, is_root)
+        if state.resets and batch.outer is not None:
+            self._wait_outside(prim, state, batch)
+            return None
         if prim.IsInstance() and not is_root:
-            key = (prim.GetPrototype().GetPath(), state.purpose, self._inheritance(prim))
-            key = (*key, self._light_groups(prim))
+            key = (prim.GetPrototype().GetPath(), state.purpose, *self._keys.of(prim))
             self._native.setdefault(key, []).append((prim, state))
             return None
         if (state.purpose or UsdGeom.Tokens.default_) in self.context.purposes:
@@ -162,6 +180,8 @@ class _Traversal:
                 self._expand(UsdGeom.PointInstancer(prim), state, batch)
             elif role in ("light", "geometry"):
                 batch.items.append(Item(prim, state.matrix, role))
+                if prim.GetTypeName() == "GeometryLight":
+                    self._keys.point_to(prim)
             elif role == "unknown":
                 text = f"prims of type {prim.GetTypeName()} are left out"
                 self.context.notes.add(f"type {prim.GetTypeName()}", text, prim)
@@ -175,64 +195,49 @@ class _Traversal:
 
     def _enter(self, prim, imageable, state: _State, is_root: bool) -> _State:
         """Return the state with a prim's own purpose and transform."""
-        purpose, matrix = state.purpose, state.matrix
+        purpose, matrix, resets = state.purpose, state.matrix, False
         authored = imageable.GetPurposeAttr()
         if authored and authored.HasAuthoredValue():
             purpose = authored.Get()
         xformable = UsdGeom.Xformable(prim)
         if xformable and not is_root and prim.HasProperty("xformOpOrder"):
             own = local_matrix(xformable, self.context.time)
-            matrix = own if xformable.GetResetXformStack() else own @ matrix
-        return _State(matrix, purpose, state.chain)
-
-    def _inheritance(self, prim: Usd.Prim) -> tuple:
-        """Return the ancestors whose material or primvars an instance inherits, itself included."""
-        path = prim.GetPath()
-        if path not in self._inherited:
-            parent = prim.GetParent()
-            above = () if not parent or parent.IsPseudoRoot() else self._inheritance(parent)
-            names = prim.GetAuthoredPropertyNames()
-            counts = any(name.startswith(("material:binding", "primvars:")) for name in names)
-            self._inherited[path] = (*above, path) if counts else above
-        return self._inherited[path]
-
-    def _light_groups(self, prim: Usd.Prim) -> tuple:
-        """Return which entries of the light groups what is below an instance belongs to."""
-        groups = self.context.light_groups
-        if not groups:
-            return ()
-        prototype = prim.GetPrototype()
-        if prototype.GetPath() not in self._below:
-            root = str(prototype.GetPath())
-            parts = Usd.PrimRange(prototype, Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate))
-            roles = ("light", "geometry", "instancer")
-            self._below[prototype.GetPath()] = [
-                str(part.GetPath())[len(root) :] for part in parts if self._role(part) in roles
-            ]
-        path = str(prim.GetPath())
-        return tuple(groups.entry_of(path + part) for part in self._below[prototype.GetPath()])
+            resets = xformable.GetResetXformStack()
+            matrix = own if resets else own @ matrix
+        return _State(matrix, purpose, state.chain, resets)
 
     def _flush_native(self, batch: Batch) -> None:
         """Make one batch of all native instances of a prototype that look the same."""
         groups, self._native = self._native, {}
-        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
-        for members in groups.values():
+        outer = batch.transforms if batch.outer is None else batch.outer
+        for members in itertools.chain(*map(self._keys.apart, groups.values())):
             prim, state = members[0]
             matrices = np.stack([member.matrix for _, member in members])
             state = _State(np.eye(4), state.purpose, state.chain)
-            self._wait(prim, state, matrices, batch, predicate)
+            self._wait(prim, state, matrices, batch, PROXIES, outer=outer)
+
+    def _wait_outside(self, prim: Usd.Prim, state: _State, batch: Batch) -> None:
+        """Make a batch of a prim that does not move with the native instances that it is in."""
+        outside = Batch(batch.outer, color=batch.color)
+        times = len(batch.transforms) // len(batch.outer)
+        matrices = np.tile(state.matrix, (times, 1, 1))
+        state = _State(np.eye(4), state.purpose, state.chain)
+        self._wait(prim, state, matrices, outside, PROXIES, outer=batch.outer)
 
     def _expand(self, instancer: UsdGeom.PointInstancer, state: _State, batch: Batch) -> None:
-        """Make one batch of all instances of each prototype."""
+        """Make one batch of all instances of each prototype and color."""
         prim, notes = instancer.GetPrim(), self.context.notes
         if prim.GetPath() in state.chain:
             notes.add("cycle", "a PointInstancer that instances itself was left out there", prim)
             return
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
-        indices, matrices = self._instances(instancer, len(targets))
+        indices, matrices, numbers = self._instances(instancer, len(targets))
+        colors, color_of = self._colors(instancer, numbers)
         inside = _State(np.eye(4), state.purpose, (*state.chain, prim.GetPath()))
-        for index in np.unique(indices):
-            root, chosen = self.context.stage.GetPrimAtPath(targets[index]), indices == index
+        groups = indices * len(colors) + color_of
+        for group in np.unique(groups):
+            index, color = divmod(int(group), len(colors))
+            root, chosen = self.context.stage.GetPrimAtPath(targets[index]), groups == group
             if not root:
                 text = f"a PointInstancer has no prototype {targets[index]}"
                 notes.add("prototype", text, prim, int(chosen.sum()))
@@ -244,16 +249,44 @@ class _Traversal:
                 predicate = predicate & ~Usd.PrimIsAbstract
             predicate = Usd.TraverseInstanceProxies(predicate)
             if root.IsActive():
-                self._wait(root, inside, matrices[chosen] @ state.matrix, batch, predicate)
+                places = matrices[chosen] @ state.matrix
+                self._wait(root, inside, places, batch, predicate, color=colors[color])
+
+    def _colors(self, instancer: UsdGeom.PointInstancer, numbers: np.ndarray):
+        """Return the colors of an instancer's instances, and which of them each instance has.
+
+        Args:
+            instancer: with displayColor for each instance, or without.
+            numbers: ``(n,)``, which ones are wanted.
+        """
+        prim, notes = instancer.GetPrim(), self.context.notes
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("displayColor")
+        if not len(numbers) or not primvar or primvar.GetInterpolation() == "constant":
+            return [None], 0
+        count = len(self.context.value(instancer.GetProtoIndicesAttr()))
+        values = display_color(prim, Sizes(count, count, count), self.context)[0]
+        if values is None:
+            return [None], 0
+        rows = np.broadcast_to(values.array, (count, 3))[numbers]
+        colors, color_of = np.unique(rows, axis=0, return_inverse=True)
+        if len(colors) > MOST_COLORS:
+            text = f"the {len(colors)} colors of an instancer are more than {MOST_COLORS}: not used"
+            notes.add("instance colors", text, prim)
+            return [None], 0
+        return colors, np.ravel(color_of)
 
     def _instances(self, instancer: UsdGeom.PointInstancer, prototypes: int):
-        """Return prototype and matrix of each visible instance, ``(n,)`` and ``(n, 4, 4)``."""
+        """Return prototype, matrix and number of each visible instance.
+
+        They have the shapes ``(n,)``, ``(n, 4, 4)`` and ``(n,)``.
+        """
         prim, notes, time = instancer.GetPrim(), self.context.notes, self.context.time
-        none = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 4))
+        empty = np.zeros(0, dtype=np.int64)
+        none = empty, np.zeros((0, 4, 4)), empty
         indices = self.context.value(instancer.GetProtoIndicesAttr())
         if indices is None or not len(indices):
             return none
-        indices = np.array(indices, dtype=np.int64)
+        indices = integers(indices)
         if time.IsDefault() and instancer.GetPositionsAttr().Get() is None:
             time = Usd.TimeCode.EarliestTime()
         # With a mask applied the matrices would be fewer than the indices. Prototypes that are
@@ -278,7 +311,8 @@ class _Traversal:
             text = "an instance with an index out of range or a transform that is not finite"
             notes.add("instance", f"{text} was left out", prim, int((bad & keep).sum()))
         keep = keep & ~bad
-        return indices[keep], self._with_prototypes(instancer, indices[keep], matrices[keep])
+        matrices = self._with_prototypes(instancer, indices[keep], matrices[keep])
+        return indices[keep], matrices, np.flatnonzero(keep)
 
     def _with_prototypes(self, instancer, indices, matrices) -> np.ndarray:
         """Return instances' matrices with the transform of each prototype's root before."""
@@ -296,8 +330,17 @@ class _Traversal:
             matrices[chosen] = own @ matrices[chosen]
         return matrices
 
-    def _wait(self, root, state: _State, matrices, batch: Batch, predicate) -> None:
-        """Remember a prototype to walk through once for all its copies."""
+    def _wait(self, root, state: _State, matrices, batch: Batch, predicate, **look) -> None:
+        """Remember a prototype to walk through once for all its copies.
+
+        Args:
+            root: of the prototype.
+            state: that it inherits.
+            matrices: ``(n, 4, 4)`` of the copies.
+            batch: that they are in.
+            predicate: of the prims to walk through.
+            look: ``outer`` and ``color`` of the new batch. Default: none, that of ``batch``.
+        """
         count = len(matrices) * len(batch.transforms)
         if count > LARGEST_BATCH or len(self.batches) > MOST_BATCHES:
             text = (
@@ -306,7 +349,9 @@ class _Traversal:
             self.context.notes.add("instances", text, root, count)
             return
         transforms = (matrices[:, None] @ batch.transforms[None]).reshape(-1, 4, 4)
-        batch = Batch(transforms, instancers=state.chain)
+        if look.get("color") is None:
+            look["color"] = batch.color
+        batch = Batch(transforms, instancers=state.chain, **look)
         self._waiting.append((root, state, batch, predicate))
 
 
