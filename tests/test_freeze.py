@@ -16,7 +16,7 @@ import pytest
 from tests import light_scenes
 from tests.conftest import require_variant
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("llvm", "own_threads")
 
 PLUGINS = ("manylights_direct", "manylights_volpath")
 
