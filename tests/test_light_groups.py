@@ -113,7 +113,6 @@ CASES = [
 ]
 
 
-@pytest.mark.usefixtures("own_threads")
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_rgb"])
 @pytest.mark.parametrize(("plugin_name", "fog", "more"), CASES)
 def test_layers_sum_to_the_image_which_is_that_without(name, plugin_name, fog, more):
@@ -146,7 +145,6 @@ def check_layers(plugin_name, fog, more):
         assert all(layer.max() > 0 for layer in layers)
 
 
-@pytest.mark.usefixtures("own_threads")
 @pytest.mark.parametrize("plugin_name", PLUGINS)
 def test_a_layer_is_what_its_lamps_alone_give(scalar, plugin_name):
     compare_with_lamps_alone(plugin_name, fog=False)
