@@ -42,7 +42,9 @@ REFERENCE_SEEDS = 64
 """Images of a reference, which are rendered together; they keep the t test's far tail short."""
 
 PILOTS = 4
-"""Short renderings that tell how many samples are needed; twice as many of dependent pixels."""
+"""Short renderings that tell how many samples are needed; twice as many of dependent pixels.
+
+The fewer there are, the more samples are rendered to be safe."""
 
 LONG_PILOTS = 32
 """As many where few pixels have nearly all of the variance of these."""
@@ -93,7 +95,7 @@ def planned_images(scene, integrator, error, first_seed, sensor=0, known=False):
         how = render_at_once if known else tools.render_seeds
         return how(scene, integrator, spp, range(first, first + count), sensor)
 
-    pilots, pilot_spp = PILOTS if independent and not known else 2 * PILOTS, 9
+    pilots, pilot_spp = pilot_count(independent, known), 9
     pilot = render(pilot_spp, first_seed, pilots)
     if not known and independent and degrees_of_freedom(pilot) < FEW_DEGREES:
         longer = render(pilot_spp, first_seed + pilots, LONG_PILOTS - pilots)
@@ -106,6 +108,13 @@ def planned_images(scene, integrator, error, first_seed, sensor=0, known=False):
         pilot, pilot_spp, count, error, independent_pixels=independent
     )
     return render(max(5, spp | 1), first_seed + 1000, count)
+
+
+def pilot_count(independent, known):
+    """How many short renderings: as many as a reference has where one wavefront traces them all."""
+    if known and independent and not mi.variant().startswith("scalar"):
+        return REFERENCE_SEEDS
+    return PILOTS if independent and not known else 2 * PILOTS
 
 
 def degrees_of_freedom(pilot):

@@ -267,7 +267,8 @@ def test_every_method_measures_the_same_image(tmp_path):
 def test_fog_is_rendered_by_integrators_for_media(tmp_path):
     source = f"fog_open:40,max_depth=3,{TINY}"
     arguments = ("--methods", "uniform,talk", "--spp", 1, "--seeds", 1, "--variant", "scalar_rgb")
-    _, data = bench(tmp_path, source, *arguments)
+    # Methods that take 20 times as long are left out, as they are on a busy machine.
+    _, data = bench(tmp_path, source, *arguments, "--time-budget", "0.2")
     scene = data["scenes"][0]
     assert scene["media"] and scene["max_depth"] == 3
     series = series_by_spec(scene)

@@ -1,4 +1,8 @@
-"""The command line as users meet it, in a process of its own, and what it is made of."""
+"""The command line as users meet it, and what it is made of.
+
+Most commands run in this process. One of each kind has its own (`manylights_process`), and so has
+what needs one: limits, signals, tracebacks, files that could end it, what the shell takes.
+"""
 
 import json
 import os
@@ -23,6 +27,7 @@ from manylights.loading import integrators, ours
 from manylights.output import exr
 from manylights.progress import Estimate, format_seconds
 
+from tests.command_line import assert_fails, manylights, manylights_process
 from tests.conftest import heed_ctrl_c, require_variant
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -64,21 +69,6 @@ PATH_PARAMETERS = """
 FOG = '<medium type="homogeneous" id="fog"/>'
 
 
-def manylights(*arguments, **options):
-    """Run the command; return the finished process with its output as text."""
-    command = [sys.executable, "-m", "manylights", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)
-
-
-def assert_fails(process, *words):
-    """The command ended with status 2 and one line that has all the words."""
-    assert process.returncode == 2, process.stderr
-    lines = process.stderr.strip().splitlines()
-    assert "Traceback" not in process.stderr
-    for word in words:
-        assert word in lines[-1]
-
-
 @pytest.fixture
 def scene(tmp_path):
     path = tmp_path / "scene.xml"
@@ -86,10 +76,8 @@ def scene(tmp_path):
     return path
 
 
-def render(scene, out, *arguments):
-    result = manylights(
-        "render", scene, "-o", out, "--variant", "scalar_rgb", "--spp", 4, *arguments
-    )
+def render(scene, out, *arguments, command=manylights):
+    result = command("render", scene, "-o", out, "--variant", "scalar_rgb", "--spp", 4, *arguments)
     assert result.returncode == 0, result.stderr
     return result
 
@@ -131,7 +119,7 @@ def test_plugin_dir_holds_the_plugins(name):
 
 
 def test_mitsuba_command_finds_the_plugin(tmp_path):
-    folder = manylights("plugin-dir").stdout.strip()
+    folder = manylights_process("plugin-dir").stdout.strip()
     executable = Path(sys.executable).parent / "mitsuba"
     if not executable.exists():
         pytest.skip("Mitsuba's command is not beside the interpreter")
@@ -143,7 +131,7 @@ def test_mitsuba_command_finds_the_plugin(tmp_path):
 
 
 def test_render_writes_image_and_preview(scene, tmp_path):
-    render(scene, tmp_path / "out.exr")
+    render(scene, tmp_path / "out.exr", command=manylights_process)
     assert (tmp_path / "out.exr").stat().st_size > 0
     assert (tmp_path / "out.png").stat().st_size > 0
     assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "out.exr", "out.png"}
@@ -151,13 +139,13 @@ def test_render_writes_image_and_preview(scene, tmp_path):
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_same_seed_gives_the_same_bytes(scene, tmp_path, variant):
-    """All of the file but the seconds that the render took."""
+    """All of the file but the seconds that the render took; also in another process."""
     variant = require_variant(variant)
     images = []
     for index, (seed, threads) in enumerate([(5, 1), (5, 2), (6, 2)]):
         out = tmp_path / f"{index}.exr"
         arguments = ("--seed", seed, "--threads", threads, "--variant", variant)
-        render(scene, out, *arguments)
+        render(scene, out, *arguments, command=manylights_process if index == 1 else manylights)
         channels, attributes = exr.read(out)
         assert attributes.pop("manylights.seconds_taken") > 0
         seeds = attributes.pop("manylights.seed"), attributes.pop("manylights.seeds")
@@ -442,7 +430,7 @@ def test_tree_of_an_integrator_for_paths():
 
 
 def test_tree_as_text():
-    result = manylights("tree", SCENES / "points.xml")
+    result = manylights_process("tree", SCENES / "points.xml")
     assert result.returncode == 0, result.stderr
     assert "12  point" in result.stdout
 
@@ -456,7 +444,7 @@ def test_demo(tmp_path):
 
 
 def test_missing_scene(tmp_path):
-    process = manylights("render", tmp_path / "no.xml", "-o", tmp_path / "o.exr")
+    process = manylights_process("render", tmp_path / "no.xml", "-o", tmp_path / "o.exr")
     assert_fails(process, "no.xml", "no such file")
 
 
@@ -606,7 +594,7 @@ def test_full_disk_leaves_nothing_half_written(scene, tmp_path, missing):
         (tmp_path / name).write_bytes(b"of an earlier render")
     command = ("render", scene, "-o", tmp_path / "out.exr", "--variant", "scalar_rgb", "--spp", 4)
     limit = (resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-    process = manylights(*command, preexec_fn=lambda: resource.setrlimit(*limit))
+    process = manylights_process(*command, preexec_fn=lambda: resource.setrlimit(*limit))
     assert_fails(process, f"{tmp_path / 'out.exr'}: not written (File too large)")
     assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "out.exr", "out.png"}
     for name in ("out.exr", "out.png"):
@@ -701,7 +689,8 @@ def test_truncated_openexr_file_does_not_end_the_process(tmp_path, part):
     path = tmp_path / "scene.xml"
     path.write_text(DIRECT.replace("</scene>", f"{shapes}</scene>"))
     for command in (("render", path, "-o", tmp_path / "out.exr"), ("tree", path)):
-        assert_fails(manylights(*command, "--variant", "scalar_rgb"), ".exr: not a whole image")
+        process = manylights_process(*command, "--variant", "scalar_rgb")
+        assert_fails(process, ".exr: not a whole image")
 
 
 @pytest.mark.parametrize("text", ["", DIRECT[:200], DIRECT[:-10], "\0\1\2", "<scene", "a scene"])
@@ -712,13 +701,13 @@ def test_scene_file_that_is_no_xml_is_named(capsys, tmp_path, text):
 
 
 def test_debug_shows_the_traceback(tmp_path):
-    process = manylights("tree", tmp_path / "no.xml", "--debug")
+    process = manylights_process("tree", tmp_path / "no.xml", "--debug")
     assert process.returncode != 0
     assert "Traceback" in process.stderr
 
 
 def test_version():
-    assert manylights("--version").stdout.strip() == __version__
+    assert manylights_process("--version").stdout.strip() == __version__
     lines = manylights("--verbose", "--version").stdout.splitlines()
     told = dict(line.split(":", 1) for line in lines)
     assert mi.__version__ in told["Mitsuba"] and told["plugins"].strip() == plugin_dir()
@@ -734,14 +723,19 @@ echo "${COMPREPLY[@]}"
 """
 
 
+@pytest.fixture(scope="module")
+def completion():
+    return manylights_process("--print-completion", "bash").stdout
+
+
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [("re", "render report"), ("render --until", "--until-noise"), ("render sc", "scene.xml")],
 )
-def test_bash_completes_commands_options_and_files(tmp_path, typed, offered):
+def test_bash_completes_commands_options_and_files(completion, tmp_path, typed, offered):
     if shutil.which("bash") is None:
         pytest.skip("there is no bash")
-    (tmp_path / "completion").write_text(manylights("--print-completion", "bash").stdout)
+    (tmp_path / "completion").write_text(completion)
     (tmp_path / "scene.xml").touch()
     done = subprocess.run(
         ["bash", "-c", COMPLETE, "bash", *typed.split()],

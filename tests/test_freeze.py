@@ -16,7 +16,7 @@ import pytest
 from tests import light_scenes
 from tests.conftest import require_variant
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("llvm", "own_threads")
 
 PLUGINS = ("manylights_direct", "manylights_volpath")
 
@@ -211,10 +211,11 @@ def test_scenes_in_turn():
 def test_gradients(plugin_name, name):
     """Of a surface and of a light: those of functions that are not recorded.
 
-    Up to rounding, by which roulette might end other paths: there is none.
+    Up to rounding, by which roulette might end other paths: there is none. Derivatives compile a
+    kernel for each shadow ray, two are enough.
     """
     depth = {"max_depth": 5} if plugin_name == "manylights_volpath" else {}
-    scene, integrator = load(), load_integrator(plugin_name, **depth)
+    scene, integrator = load(), load_integrator(plugin_name, shadow_rays=2, **depth)
     key = parameter(scene, name)
 
     def gradient(scene, seed):

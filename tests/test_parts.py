@@ -32,11 +32,13 @@ VARIANTS = ["scalar_rgb", "llvm_ad_rgb"]
 MITSUBAS = ("--integrator", "path", "--sampler", "independent")
 
 
-@pytest.fixture(autouse=True)
-def short_steps(monkeypatch):
+@pytest.fixture(scope="module", autouse=True)
+def short_steps():
     """Also small images are rendered in many steps: of 1024 samples at most."""
-    monkeypatch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
-    monkeypatch.setattr(plan, "MOST_SAMPLES", dict.fromkeys(plan.MOST_SAMPLES, 2**10))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "SINGLE_STEP_SAMPLES", 0)
+        patch.setattr(plan, "MOST_SAMPLES", dict.fromkeys(plan.MOST_SAMPLES, 2**10))
+        yield
 
 
 def write_scene(path, name="many_bulbs", filter_type="gaussian", pixel_format="rgb"):
@@ -58,17 +60,27 @@ def scene(tmp_path):
     return write_scene(tmp_path / "scene.xml")
 
 
+def main(*arguments):
+    """Run the command in this process; return the exit status."""
+    return cli.main(list(map(str, arguments)))
+
+
+def render_options(variant="scalar_rgb", seed=5):
+    """Options of a small render of 19 steps."""
+    options = ("--variant", variant, "--spp", 37, "--seed", seed, "--threads", 1)
+    return (*options, "-D", "resx=28", "-D", "resy=18")
+
+
 @pytest.fixture
 def run(scene, tmp_path, capsys):
     """A function that runs `render` (19 steps) or `merge`; returns exit status and log."""
 
     def call(*arguments):
-        return cli.main(list(map(str, arguments))), capsys.readouterr().err
+        return main(*arguments), capsys.readouterr().err
 
     def render(*arguments, variant="scalar_rgb", out="a.exr", path=scene, seed=5):
-        size = ("-D", "resx=28", "-D", "resy=18")
-        options = ("--variant", variant, "--spp", 37, "--seed", seed, "--threads", 1)
-        return call("render", path, "-o", tmp_path / out, *options, *size, *arguments)
+        options = render_options(variant, seed)
+        return call("render", path, "-o", tmp_path / out, *options, *arguments)
 
     def merge(*arguments, out="merged.exr"):
         return call("merge", *arguments, "-o", tmp_path / out)
@@ -384,10 +396,21 @@ def test_targets_have_no_parts(run):
 # --------------------------------------------------------------------------------------- refusals
 
 
+@pytest.fixture(scope="module")
+def rendered_parts(tmp_path_factory):
+    """Both parts of a render, not to be changed."""
+    folder = tmp_path_factory.mktemp("two")
+    scene = write_scene(folder / "scene.xml")
+    for number in (1, 2):
+        part = ("--part", f"{number}/2", "-o", folder / "a.exr")
+        assert main("render", scene, *render_options(), *part) == 0
+    return sorted(folder.glob("a.part-*.exr"))
+
+
 @pytest.fixture
-def two(parts):
-    """Both parts of a render."""
-    return parts(2)
+def two(rendered_parts, scene, tmp_path):
+    """Copies of them, beside the scene."""
+    return [Path(shutil.copy(path, tmp_path)) for path in rendered_parts]
 
 
 def test_missing_parts_are_named_with_the_command(run, parts, scene, tmp_path):

@@ -28,9 +28,10 @@ IMAGES, SAMPLES = 8, 12
 
 # The camera looks at hundreds of small, bright bulbs: their borders are most of the noise. In fog,
 # it is the lamps close by, and the glass, through which light is found by chance only. With more
-# images the variance is better known. Visibility is learnt from 2^16 samples, 11 per pixel.
+# images the variance is better known, with fewer those are rendered that take long and have little
+# noise. Visibility is learnt from 2^16 samples, 11 per pixel.
 EFFORT_OF = {"many_bulbs": (16, 12), "curves": (10, 12), "glass_fog": (12, 12)}
-EFFORT_OF["heterogeneous"] = (12, 12)
+EFFORT_OF |= {"heterogeneous": (6, 12), "fog": (6, 12), "interior": (6, 12)}
 BIAS_OF = {"no_lights": None}
 
 

@@ -146,29 +146,39 @@ def test_scene_is_left_as_it_was(short_steps, llvm):
 
 
 @pytest.fixture
-def few_pilots(monkeypatch, scalar):
-    """Renders of small images begin with few samples; scalar variants are fast there."""
+def fewer_pilots(monkeypatch):
+    """Renders of small images begin with few samples."""
     monkeypatch.setattr(plan, "PILOT_SAMPLES", 2**13)
 
 
-def images_and_noises(scene, spp, seeds):
-    """Renders of so many samples, from four sequences, and the noise that each tells."""
-    results = [
-        manylights.render(scene, spp=spp, seed=seed, until_noise=1e-9, integrator=None)
-        for seed in seeds
-    ]
+@pytest.fixture
+def few_pilots(fewer_pilots, scalar):
+    """The same in the scalar variant, which is fast there."""
+
+
+def renders(scene, spp, seeds):
+    """Renders of so many samples, from four sequences, with this process's share of the cores."""
+    wanted = {"spp": spp, "until_noise": 1e-9, "threads": tools.THREADS}
+    results = [manylights.render(scene, seed=seed, **wanted) for seed in seeds]
     assert all(result.samples == spp for result in results)
-    return np.stack([result.image for result in results]), [result.noise for result in results]
+    return results
 
 
 @pytest.mark.parametrize(
-    ("name", "width", "height"), [("many_bulbs", 40, 24), ("interior", 40, 24), ("points", 96, 64)]
+    ("variant", "name", "width", "height"),
+    [
+        ("scalar_rgb", "many_bulbs", 40, 24),
+        ("scalar_rgb", "interior", 40, 24),
+        ("llvm_ad_rgb", "points", 96, 64),
+    ],
 )
-def test_noise_is_that_of_many_seeds(few_pilots, name, width, height):
-    images, noises = images_and_noises(loaded(name, width, height), 32, range(16))
+def test_noise_is_that_of_many_seeds(fewer_pilots, variant, name, width, height):
+    require_variant(variant)
+    results = renders(loaded(name, width, height), 32, range(16))
+    images, noises = (np.array([getattr(r, x) for r in results]) for x in ("image", "noise"))
     mean = images.mean(axis=0)
     truth = noise.noise(mean, images.var(axis=0, ddof=1))
-    assert np.all(np.abs(np.array(noises) / truth - 1.0) < 0.2), (truth, noises)
+    assert np.all(np.abs(noises / truth - 1.0) < 0.2), (truth, noises)
 
 
 def test_noise_of_parts_of_one_sequence_is_too_high(few_pilots):
@@ -188,14 +198,14 @@ def test_noise_of_parts_of_one_sequence_is_too_high(few_pilots):
     assert wrong > 1.2 * truth, (wrong, truth)
 
 
-def test_variance_is_that_of_the_image(few_pilots):
+def test_variance_is_that_of_the_image(fewer_pilots, llvm):
     """Its mean over the pixels, against half the squared differences of images of two seeds.
 
     Without the noisiest tenth of the pixels, whose few bright samples are most of the mean; those
     are seen in other images.
     """
     scene = loaded("points", 64, 40)
-    results = [manylights.render(scene, spp=32, seed=seed, until_noise=1e-9) for seed in range(32)]
+    results = renders(scene, 32, range(48))
     images = np.stack([result.image for result in results])
     assert results[0].variance.shape == images[0].shape
     others = [manylights.render(scene, spp=32, seed=seed).image for seed in range(100, 108)]
@@ -219,7 +229,8 @@ def test_noise_asked_for_is_reached(few_pilots, name, asked):
 def test_mean_of_renders_until_a_noise_has_no_bias(few_pilots):
     """How many samples there are depends on them; a bias of two percent would be found."""
     scene = loaded("points", 16, 10, filter_type="box")
-    results = [manylights.render(scene, seed=s, until_noise=0.02) for s in range(100, 132)]
+    wanted = {"until_noise": 0.02, "threads": tools.THREADS}
+    results = [manylights.render(scene, seed=s, **wanted) for s in range(100, 132)]
     assert len({result.samples for result in results}) > 1
     images = np.stack([result.image for result in results])
     reference = tools.render_seeds(scene.scene, spp=256, seeds=range(8))

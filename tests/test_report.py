@@ -31,7 +31,7 @@ from manylights.report import (
 from manylights.report.text import number
 
 from tests import browser, report_data
-from tests.test_cli import assert_fails, manylights
+from tests.command_line import assert_fails, manylights
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +79,21 @@ def undrawn(monkeypatch):
 
     monkeypatch.setattr(charts, "save", save)
     monkeypatch.setattr(sheets, "save", save)
+
+
+@pytest.fixture
+def draw_only(monkeypatch):
+    """A function that leaves all charts empty but those whose names begin in this way."""
+    save = charts.save
+
+    def choose(start):
+        def save_some(name, figure, folder):
+            return save(name, figure, folder) if name.startswith(start) else b""
+
+        monkeypatch.setattr(charts, "save", save_some)
+        monkeypatch.setattr(sheets, "save", save_some)
+
+    return choose
 
 
 # --- Statistics -------------------------------------------------------------------------------
@@ -271,7 +286,8 @@ def test_charts_have_stable_names(folder):
         assert {f"{stem}.svg", f"{stem}.png"} <= names
 
 
-def test_denoised_images_have_a_chart(tmp_path):
+def test_denoised_images_have_a_chart(tmp_path, draw_only):
+    draw_only("denoised")
     data = report_data.write_results(tmp_path, report_data.all_scenes()[:1])
     scene = data["scenes"][0]
     for series in scene["series"]:
@@ -463,7 +479,8 @@ def test_maps_without_channels_are_told(small, undrawn):
     assert remarks == ["room/talk.maps.exr: has no channel candidates, node_visits"]
 
 
-def test_missing_variance_is_left_out_with_a_remark(small):
+def test_missing_variance_is_left_out_with_a_remark(small, draw_only):
+    draw_only("boundary")
     path = small(boundary=True)
     (path / "room" / "talk.variance.exr").unlink()
     _, remarks = page.render(records.load(path), publish=False)
@@ -624,15 +641,9 @@ def test_defects_are_seen(folder, tmp_path, defect, finding):
         assert_fine(findings)
 
 
-def test_numbers_alone_make_a_page(tmp_path, monkeypatch):
+def test_numbers_alone_make_a_page(tmp_path, draw_only):
     """The published results of the standard scenes have no pictures; one chart has all scenes."""
-    save = charts.save
-
-    def save_overview(name, figure, folder):
-        return save(name, figure, folder) if name == "overview" else b""
-
-    monkeypatch.setattr(charts, "save", save_overview)
-    monkeypatch.setattr(sheets, "save", save_overview)
+    draw_only("overview")
     published = Path(__file__).parents[1] / "scenes" / "bench" / "results.json"
     (tmp_path / "results.json").write_bytes(published.read_bytes())
     written, remarks = page.write_report(str(tmp_path), None, publish=False)

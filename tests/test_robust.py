@@ -359,6 +359,7 @@ SCENES = {
 }
 
 
+@pytest.mark.usefixtures("own_threads")
 @pytest.mark.parametrize("variant", ["scalar_rgb", "scalar_spectral"], indirect=True)
 @pytest.mark.parametrize("name", OURS)
 def test_all_scenes_with_all_methods_are_finite(variant, name):

@@ -347,8 +347,11 @@ def direct_call(kind, scene, integrator):
 @both_plugins
 @pytest.mark.parametrize("kind", ["render", "sample"])
 def test_derivatives_of_direct_calls(llvm, plugin_name, kind):
-    """Forward and backward, against finite differences with the same random numbers."""
-    scene, integrator = derivative_scene(plugin_name), load(plugin_name)
+    """Forward and backward, against finite differences with the same random numbers.
+
+    Derivatives compile a kernel for each shadow ray, two are enough.
+    """
+    scene, integrator = derivative_scene(plugin_name), load(plugin_name, shadow_rays=2)
     parameters = mi.traverse(scene)
 
     def mean(factor):
