@@ -115,6 +115,30 @@ def test_paths_in_dense_fog_far_from_the_origin(variant):
 
 
 @both_variants
+@pytest.mark.parametrize("kind", GRIDS)
+def test_lamp_behind_the_border_of_dense_fog(variant, kind):
+    """Rays go on a bit behind a border, more of it far from the origin; the fog in between counts.
+
+    `volpath` loses 9e-5 (1 + 100) units of it: 9 %.
+    """
+    x, sigma, length = 100.0, 10.0, 0.2
+    lamp = {"type": "area", "radiance": 1.0}
+    scene = {
+        "type": "scene",
+        "fog": {
+            "type": "cube",
+            "to_world": transform().translate([x + 1, 0, 0]),
+            "bsdf": NULL,
+            "interior": fog(kind, sigma, (x, -1, -1), (x + 2, 1, 1)),
+        },
+        "lamp": {**wall(x + length, 0.0), "emitter": lamp},
+        "sensor": camera((x - 1, 0, 0), (x, 0, 0)),
+    }
+    exact = np.exp(-sigma * length)
+    assert_exact(images_of(scene, max_depth=1), exact, label=f"into fog, {kind}, {variant}")
+
+
+@both_variants
 def test_hidden_emitter_is_still_a_border(variant):
     """What is behind a hidden emitter is seen through the fog that it encloses."""
     medium = fog("homogeneous", 1.0, None, None)

@@ -435,6 +435,19 @@ def bulbs(count, radius, radiance, low, high):
     ]
 
 
+def dense_fog(within=False):
+    """Bulbs below the top of dense fog; `within`: in nothing but fog, seen from where its top was.
+
+    The light is the same, and no ray passes a border, behind which Mitsuba's begin too deep.
+    """
+    balls = bulbs(100, 0.02, 100.0, (-0.6, -0.6, 1.9), (0.6, 0.6, 1.95))
+    result = fog(50.0, balls, half=1.0)
+    if within:
+        medium = result.pop("fog")["interior"]
+        result["sensor"] = {**camera(origin=(0, 0, 2), near=0.01), "medium": medium}
+    return result
+
+
 def wide_filter():
     """A filter that spreads each sample over several pixels."""
     return scene(points(300), size=2.0, rfilter="gaussian")
@@ -546,7 +559,8 @@ CASES = {
     ),
     "dense-fog": Case(
         "mean free path of 1/50",
-        lambda: fog(50.0, bulbs(100, 0.02, 100.0, (-0.6, -0.6, 1.9), (0.6, 0.6, 1.95)), half=1.0),
+        dense_fog,
+        same_as=lambda: dense_fog(within=True),
         parameters={"max_depth": 2},
         slow=True,
         plain=False,
