@@ -237,6 +237,7 @@ def test_parts_of_large_renders_add_up(llvm):
     """More samples than are evaluated at once: pixels have all of theirs, borders no seams."""
     scene = mi.load_dict(manylights.scenes.behind_wall(4, width=96, height=96, spp=8192))
     found = sums(scene, integrator(), [], spp=8192)
-    expected = sum(sums(scene, integrator(), [(0, 1024, ALL, 0)], seed) for seed in range(8))
+    parts = (sums(scene, integrator(), [(0, 1024, ALL, 0)], seed, 1024) for seed in range(8))
+    expected = sum(parts)
     ratio = found[..., -1] / expected[..., -1]
     np.testing.assert_allclose(ratio, 1.0, atol=0.02)
