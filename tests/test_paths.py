@@ -398,7 +398,7 @@ PLANTED = {
     "extinction-fog": ("fog", ("sigma_t",), 1.2),
     "extinction-chromatic": ("fog-chromatic", ("sigma_t",), 1.08),
     "extinction-glass": ("fog-in-glass", ("scale",), 1.6),
-    "density-smoke": ("smoke-chromatic", ("scale",), 1.08),
+    "density-smoke": ("smoke-chromatic", ("scale",), 1.5),
     "albedo-fog": ("fog", ("albedo",), 0.97),
     "albedo-nested": ("nested", ("albedo",), 0.95),
     "phase-hg-forward": ("phase-hg-forward", ("g",), 0.94),
