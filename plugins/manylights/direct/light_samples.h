@@ -22,7 +22,10 @@ SegmentDistances<FloatD> distances_to(const TreeView<FloatD> &tree,
                                       const Receiver<FloatD> &at,
                                       const Row<FloatD> &row) {
     Appearance<FloatD> light = appearance(at, row, tree.kinds);
-    return { at, light.w, light.variance };
+    if (!have_beams(tree.kinds))
+        return { at, light.w, light.variance, nullptr };
+    Beam<FloatD> shines = beam(row, tree.kinds);
+    return { at, light.w, light.variance, &shines };
 }
 
 template <typename Float, typename Spectrum> class LightSamples {

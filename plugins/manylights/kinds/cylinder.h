@@ -67,6 +67,8 @@ struct CylinderLight {
         return norm(row.geometry + 3) + 2 * row.geometry[6];
     }
 
+    template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x, float) {

@@ -63,6 +63,10 @@ struct DiskLight {
         return 2 * std::max(norm(row.geometry + 3), norm(row.geometry + 6));
     }
 
+    template <typename Float> static Beam<Float> beam(const Row<Float> &row) {
+        return flat_beam(row);
+    }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x,

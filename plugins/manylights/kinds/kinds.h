@@ -89,6 +89,17 @@ dr::mask_t<Float> is_delta(const Row<Float> &row, KindSet kinds) {
     return result;
 }
 
+/// Are there lights that shine to one side only, or in a cone?
+inline bool have_beams(KindSet kinds) {
+    return kinds.has(LightKind::Spot) || kinds.has(LightKind::Triangle) ||
+           kinds.has(LightKind::Disk);
+}
+
+/// Where a light shines
+template <typename Float> Beam<Float> beam(const Row<Float> &row, KindSet kinds) {
+    return by_kind<Beam<Float>>(row, kinds, [&](auto light) { return light.beam(row); });
+}
+
 /// How a light appears from x; no less than a share of `least` of its largest intensity where
 /// that depends on the direction, if other points near x see more of it
 template <typename Float>

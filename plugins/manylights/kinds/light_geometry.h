@@ -24,6 +24,15 @@ template <typename Float> struct Appearance {
     DRJIT_STRUCT(Appearance, w, variance, intensity)
 };
 
+/// All directions in which a light shines: those whose cosine with the axis is no less
+template <typename Float> struct Beam {
+    using Vector3f = mitsuba::Vector<Float, 3>;
+    Vector3f axis  = 0.f;
+    Float cosine   = -1.f;
+
+    DRJIT_STRUCT(Beam, axis, cosine)
+};
+
 /// A point on a light as seen from a reference point
 template <typename Float> struct LightPoint {
     using Vector3f = mitsuba::Vector<Float, 3>;
@@ -68,6 +77,8 @@ LightPoint<Float> surface_point(const mitsuba::Point<Float, 3> &p, const Float &
 struct WithoutSurface {
     static float diameter(const LightRow &) { return 0; }
 
+    template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
+
     template <typename Float>
     static mitsuba::Vector<Float, 3> normal(const Row<Float> &,
                                             const typename Row<Float>::Point3f &) {
@@ -108,6 +119,12 @@ template <typename Float, typename Vector3f> Float can_shine(const Vector3f &w) 
 /// Unit normal of a triangle or a disk
 template <typename Float> mitsuba::Vector<Float, 3> flat_normal(const Row<Float> &row) {
     return dr::normalize(dr::cross(row.vector(3), row.vector(6)));
+}
+
+/// The side to which it emits
+template <typename Float>
+Beam<Float> flat_beam(const Row<Float> &row, const dr::mask_t<Float> &two_sided = false) {
+    return { flat_normal(row), dr::select(two_sided, Float(-1.f), Float(0.f)) };
 }
 
 /// Density of the direction w to a uniform point of a triangle or a disk, whose area is

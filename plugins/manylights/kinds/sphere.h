@@ -74,6 +74,8 @@ struct SphereLight {
 
     static float diameter(const LightRow &row) { return 2 * row.geometry[3]; }
 
+    template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x, float) {

@@ -59,6 +59,10 @@ struct SpotLight : DeltaLight {
 
     static bool is_narrow(const LightRow &row) { return row.geometry[6] < kWidestBeam; }
 
+    template <typename Float> static Beam<Float> beam(const Row<Float> &row) {
+        return { row.vector(3), dr::cos(row[6]) };
+    }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x,

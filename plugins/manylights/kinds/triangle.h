@@ -83,6 +83,10 @@ struct TriangleLight {
             { norm(u), norm(v), norm(u[0] - v[0], u[1] - v[1], u[2] - v[2]) });
     }
 
+    template <typename Float> static Beam<Float> beam(const Row<Float> &row) {
+        return flat_beam(row, row.two_sided());
+    }
+
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,
                                         const typename Row<Float>::Point3f &x,

@@ -10,9 +10,10 @@
  * of them, half of the time with equal angles as seen from the light (Kulla and Fajardo,
  * "Importance Sampling Techniques for Path Tracing in Participating Media", 2012), half
  * of the time in proportion to the transmittance: that of a random channel or wavelength
- * where these differ.
+ * where these differ. The angles are those of the light's beam.
  */
 
+#include "manylights/kinds/light_geometry.h"
 #include "segment_view.h"
 
 namespace manylights {
@@ -24,11 +25,18 @@ public:
     using UInt32   = dr::uint32_array_t<Float>;
     using Vector3f = mitsuba::Vector<Float, 3>;
 
-    /// @param w  from the start of the segment to the light's centre
-    SegmentDistances(const Receiver &at, const Vector3f &w, const Float &variance)
-        : m_at(at),
-          m_view(-dr::dot(at.wi, w), dr::squared_norm(w), variance, at.nearby()),
-          m_angle(m_view.angle()) {}
+    /**
+     * @param w     from the start of the segment to the light's centre
+     * @param beam  where the light shines, null if everywhere
+     */
+    SegmentDistances(const Receiver &at, const Vector3f &w, const Float &variance,
+                     const Beam<Float> *beam)
+        : m_at(at), m_start(0.f),
+          m_view(-dr::dot(at.wi, w), dr::squared_norm(w), variance, at.nearby()) {
+        if (beam)
+            restrict(w, *beam);
+        m_angle = m_view.angle();
+    }
 
     /// @param channel  random, below \ref Receiver::channels
     Float sample(const Float &u, const UInt32 &channel) const {
@@ -38,9 +46,11 @@ public:
     }
 
     Float pdf(const Float &t) const {
-        Float offset = t - m_view.nearest, d2 = dr::square(m_view.distance);
+        Float on_view = t - m_start, offset = on_view - m_view.nearest,
+              d2          = dr::square(m_view.distance);
         Float equiangular = m_view.distance / (m_angle * dr::fmadd(offset, offset, d2));
-        equiangular       = dr::select(t <= m_view.length, equiangular, 0.f);
+        equiangular =
+            dr::select(on_view >= 0.f && on_view <= m_view.length, equiangular, 0.f);
         return .5f * (equiangular + transmittance_pdf(m_at, t));
     }
 
@@ -73,16 +83,47 @@ private:
         return dr::select(depth < kThin, dr::rcp(length), pdf);
     }
 
-    /// n^2 sin / (D cos + nearest sin) with the angle from the segment's start, at a distance
+    /**
+     * Let the view be of the part of the segment that is in a beam, if there is any. The cosine of
+     * its axis with the direction to nearest + D x is (across + along x) / sqrt(1 + x^2): that of
+     * the beam's border at the roots of a quadratic.
+     */
+    void restrict(const Vector3f &w, const Beam<Float> &beam) {
+        Float along  = -dr::dot(beam.axis, m_at.wi),
+              across = dr::fmsub(m_view.nearest, along, dr::dot(beam.axis, w)) /
+                       m_view.distance,
+              c2 = dr::square(beam.cosine), a = dr::fmsub(along, along, c2),
+              rest   = dr::fmadd(across, across, a),
+              root   = beam.cosine * dr::sqrt(dr::maximum(rest, 0.f)),
+              middle = -across * along;
+        Float one = (middle - root) / a, two = (middle + root) / a;
+        auto open = a > 0.f, met = open || (rest > 0.f && across > 0.f);
+        Float low = dr::minimum(one, two), high = dr::maximum(one, two);
+        Float from = dr::select(open, dr::select(along > 0.f, high, -dr::Infinity<Float>),
+                                low),
+              to   = dr::select(open, dr::select(along > 0.f, dr::Infinity<Float>, low),
+                                high);
+        from       = dr::clip(dr::fmadd(m_view.distance, from, m_view.nearest), 0.f,
+                              m_view.length);
+        to = dr::clip(dr::fmadd(m_view.distance, to, m_view.nearest), 0.f, m_view.length);
+        auto cut = beam.cosine >= 0.f && met && to > from;
+        m_start  = dr::select(cut, from, 0.f);
+        m_view.nearest -= m_start;
+        m_view.length = dr::select(cut, to - from, m_view.length);
+    }
+
+    /// n^2 sin / (D cos + nearest sin) with the angle from the view's start, at a distance
     /// n from the light: no difference of large numbers
     Float sample_equiangular(const Float &v) const {
         auto [sin, cos] = dr::sincos(v * m_angle);
         Float n2        = dr::square(m_view.nearest) + dr::square(m_view.distance);
         Float t = n2 * sin / dr::fmadd(m_view.distance, cos, m_view.nearest * sin);
-        return dr::clip(t, 0.f, m_view.length);
+        return m_start + dr::clip(t, 0.f, m_view.length);
     }
 
     const Receiver &m_at;
+    /// Where the angles begin
+    Float m_start;
     SegmentView<Float, Float> m_view;
     Float m_angle;
 };

@@ -27,6 +27,13 @@ template <typename Value, typename Float> struct SegmentView {
                          dr::fnmadd(nearest, beyond, distance * distance));
     }
 
+    /// Sine and cosine of the angle of a point of the segment, 0 at the line's nearest one
+    std::pair<Value, Value> direction(const Value &t) const {
+        Value off = t - nearest,
+              inv = dr::rsqrt(dr::fmadd(off, off, distance * distance));
+        return { off * inv, distance * inv };
+    }
+
     /// Point of the segment that is nearest to the light
     Value closest() const { return dr::clip(nearest, 0.f, length); }
 };

@@ -69,27 +69,71 @@ Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
 }
 
 /**
- * h of four clusters for a segment: flux * angle / D, which is the integral of
- * flux / distance^2, times emission and attenuation at the nearest point.
+ * Emission towards a segment, integrated over the angle phi that it fills as seen from the light,
+ * which is 0 at the nearest point of the line: `along` and `across` are the mean axis in the
+ * segment's direction and in that of the nearest point. A beam may cross it far from there.
+ *
+ * With o = across cos(phi) + along sin(phi) = m cos(phi - psi) the harmonics have an integral, and
+ * so has the lobe with 1 - (phi - psi)^2 / 2 in place of the cosine.
+ */
+template <typename Float>
+Four<Float> segment_emission(const Clusters<Float> &c,
+                             const SegmentView<Four<Float>, Float> &view,
+                             const Four<Float> &along, const Four<Float> &across,
+                             const Four<Float> &variance, Directions directions) {
+    using F4 = Four<Float>;
+    F4 angle = view.angle(), a2 = dr::square(across), b2 = dr::square(along),
+       r2 = dr::fmadd(c.axis[0], c.axis[0],
+                      dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+    if (directions == Directions::Broad) {
+        auto [sin_a, cos_a] = view.direction(F4(0.f));
+        auto [sin_b, cos_b] = view.direction(F4(view.length));
+        F4 o                = across * (sin_b - sin_a) + along * (cos_a - cos_b),
+           o2 = .5f * ((a2 + b2) * angle + (a2 - b2) * (sin_b * cos_b - sin_a * cos_a)) +
+                across * along * (sin_b * sin_b - sin_a * sin_a);
+        return max_of((1.f - .75f * r2) * angle + 2.f * o + 2.25f * o2,
+                      kEmissionFloor * angle);
+    }
+    F4 first = dr::atan2(-view.nearest, view.distance) - dr::atan2(along, across);
+    // The turn whose middle is nearest to the axis
+    first -= dr::TwoPi<Float> * dr::round((first + .5f * angle) * dr::InvTwoPi<Float>);
+    F4 inv_r  = dr::rsqrt(r2 + 1e-8f),
+       spread = (1.f - r2) * inv_r * dr::rcp(3.f - r2) + variance,
+       k      = dr::rcp(max_of(spread, kNarrowestBeam)),
+       peak = 2.f * k * dr::rcp(1.f - dr::exp(-2.f * k)), o = dr::sqrt(a2 + b2) * inv_r,
+       s = dr::sqrt(.5f * max_of(k * o, 1e-3f)), mean = .5f * dr::sqrt(dr::Pi<Float>) / s;
+    return max_of(peak * dr::exp(k * (o - 1.f)) * mean *
+                      (dr::erf(s * (first + angle)) - dr::erf(s * first)),
+                  kEmissionFloor * angle);
+}
+
+/**
+ * h of four clusters for a segment: flux / D times the angle that it fills, which is the integral
+ * of flux / distance^2, or times the emission over that angle; times the attenuation at its
+ * nearest point.
  */
 template <typename Float>
 Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> &c,
                                Directions directions) {
     using F4 = Four<Float>;
-    F4 wx = c.mean[0] - at.p.x(), wy = c.mean[1] - at.p.y(), wz = c.mean[2] - at.p.z();
-    F4 along =
-        -dr::fmadd(wx, F4(at.wi.x()), dr::fmadd(wy, F4(at.wi.y()), wz * at.wi.z()));
-    F4 norm2     = dr::fmadd(wx, wx, dr::fmadd(wy, wy, wz * wz));
-    Float length = at.nearby();
-    SegmentView<F4, Float> view(along, norm2, c.variance, length);
-    F4 t = view.closest(), off = along - t;
-    F4 e          = dr::sqrt(dr::fmadd(off, off, dr::square(view.distance)));
-    F4 importance = c.flux * view.angle() / view.distance * attenuation(at, F4(t + e));
-    if (directions != Directions::All)
-        importance *= emission(
-            c, F4(dr::fmadd(t, F4(at.wi.x()), wx)), F4(dr::fmadd(t, F4(at.wi.y()), wy)),
-            F4(dr::fmadd(t, F4(at.wi.z()), wz)), F4(dr::rcp(e)), directions);
-    return importance;
+    auto dot = [](const auto &x, const auto &y) {
+        return dr::fmadd(x[0], y[0], dr::fmadd(x[1], y[1], x[2] * y[2]));
+    };
+    F4 w[3]  = { c.mean[0] - at.p.x(), c.mean[1] - at.p.y(), c.mean[2] - at.p.z() },
+       d[3]  = { -at.wi.x(), -at.wi.y(), -at.wi.z() };
+    F4 start = dot(w, d);
+    SegmentView<F4, Float> view(start, dot(w, w), c.variance, at.nearby());
+    F4 t = view.closest(), off = start - t,
+       e2    = dr::fmadd(off, off, dr::square(view.distance)),
+       inv_d = dr::rcp(view.distance), seen;
+    if (directions == Directions::All) {
+        seen = view.angle();
+    } else {
+        F4 along = dot(c.axis, d), across = (start * along - dot(c.axis, w)) * inv_d;
+        seen = segment_emission(c, view, along, across, F4(c.variance * dr::rcp(e2)),
+                                directions);
+    }
+    return c.flux * inv_d * seen * attenuation(at, F4(t + dr::sqrt(e2)));
 }
 
 /**

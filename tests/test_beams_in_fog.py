@@ -1,0 +1,128 @@
+"""Single scattering along a view that meets the light of a lamp on a part of its way only.
+
+Spots light the fog in their cone, flat lamps on one side: what lies before and behind is dark, and
+so may be the point that is nearest to the lamp.
+"""
+
+from functools import cache
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.test_media_closed_forms import camera
+from tests.test_path_closed_forms import assert_exact, both_variants, images_of
+
+pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
+
+SIGMA, ALBEDO = 0.1, 0.8
+
+#: Distances along the view, which is the z axis.
+DISTANCES = np.linspace(0, 150, 300_001)
+
+
+def scene(lamps):
+    """Lamps in fog without borders, seen along the z axis."""
+    medium = {"type": "homogeneous", "sigma_t": SIGMA, "albedo": ALBEDO}
+    view = camera((0, 0, 0), (0, 0, 1), fov=0.001, up=(0, 1, 0), medium=medium)
+    return {"type": "scene", "sensor": view, **lamps}
+
+
+def spot(place, target, cutoff, beam=None, intensity=1.0):
+    """A spot that shines at a target; angles in degrees."""
+    frame = mi.ScalarTransform4f().look_at(list(place), list(target), [0, 1, 0.1])
+    angles = {"cutoff_angle": cutoff, "beam_width": 0.75 * cutoff if beam is None else beam}
+    return {"type": "spot", "to_world": frame, "intensity": intensity, **angles}
+
+
+def small_disk(place, target, radius=1e-3):
+    """A lamp that faces a target, of intensity 1 along its axis."""
+    frame = mi.ScalarTransform4f().look_at(list(place), list(target), [0, 1, 0.1]).scale(radius)
+    emitter = {"type": "area", "radiance": 1 / (np.pi * radius**2)}
+    return {"type": "disk", "to_world": frame, "emitter": emitter}
+
+
+def along_the_view(place, target, shape):
+    """Light that a lamp sends along the view, whose intensity is ``shape`` of the cosine."""
+    w = np.stack(np.broadcast_arrays(-place[0], -place[1], DISTANCES - place[2]), axis=-1)
+    axis = np.subtract(target, place) / np.linalg.norm(np.subtract(target, place))
+    r = np.linalg.norm(w, axis=-1)
+    arrives = shape(w @ axis / r) / r**2 * np.exp(-SIGMA * (DISTANCES + r))
+    return np.trapezoid(ALBEDO * SIGMA / (4 * np.pi) * arrives, DISTANCES)
+
+
+def of_spot(place, target, cutoff, beam=None, intensity=1.0):
+    """The same for a spot: falls from 1 at the beam's width to 0 at the cutoff, by the angle."""
+    beam = 0.75 * cutoff if beam is None else beam
+    angle = lambda cosine: np.degrees(np.arccos(np.clip(cosine, -1, 1)))  # noqa: E731
+    fall = lambda cosine: np.clip((cutoff - angle(cosine)) / (cutoff - beam), 0, 1)  # noqa: E731
+    return intensity * along_the_view(place, target, fall)
+
+
+#: Lamp, target, angle of the cone. The nearest point of the view is dark but in the first two.
+BEAMS = {
+    "across": ((1, 0, 5), (0, 0, 5), 10),
+    "wide": ((1, 0, 5), (0, 0, 6), 80),
+    "ahead": ((1, 0.5, 5), (0, 0, 12), 3),
+    "back": ((1, 0.5, 15), (0, 0, 6), 3),
+    "along": ((0.5, 0, 5), (0.5, 0.1, 9), 12),
+    "against": ((0.5, 0, 9), (0.5, 0.1, 3), 12),
+    "behind the camera": ((1, 0, -5), (0, 0, 3), 5),
+    "partly behind the camera": ((1, 0, 2), (0, 0, 0.1), 30),
+    "half a sphere": ((1, 0, 5), (1, 0, 9), 90),
+    "more than half": ((1, 0, 5), (1, 0, 9), 120),
+}
+
+
+@both_variants
+@pytest.mark.parametrize("name", BEAMS)
+def test_beam_of_one_spot(variant, name):
+    """By quadrature along the view."""
+    exact = of_spot(*BEAMS[name])
+    images = images_of(scene({"spot": spot(*BEAMS[name])}), max_depth=2)
+    assert_exact(images, exact, label=f"{name}, {variant}")
+
+
+@both_variants
+def test_beam_that_does_not_meet_the_view(variant):
+    """There is no light at all."""
+    dark = spot((1, 0, 5), (2, 0, 5), 40)
+    assert (images_of(scene({"spot": dark}), max_depth=2) == 0).all()
+
+
+@both_variants
+@pytest.mark.parametrize("target", [(1, 0, 4), (1, 0, 9), (0, 0, 5.5), (2, 0, 9), (2, 0.3, 4.5)])
+def test_side_of_a_flat_lamp(variant, target):
+    """By quadrature along the view: in front, behind, and before the lamp."""
+    place = (1, 0, 5)
+    exact = along_the_view(place, target, lambda cosine: np.maximum(cosine, 0))
+    images = images_of(scene({"disk": small_disk(place, target)}), max_depth=2)
+    assert_exact(images, exact, label=f"disk towards {target}, {variant}")
+
+
+@cache
+def far_beams():
+    """A hundred spots, and their light along the view.
+
+    Narrow ones, which have most of it, cross the view far ahead of them, where the nearest point is
+    dark; the others turn away from it.
+    """
+    rng = np.random.default_rng(1)
+    lamps, exact = {}, 0.0
+    for i in range(100):
+        x, y = rng.normal([2, 0])
+        z, turn = rng.uniform(0, 30), rng.normal()
+        if i % 25 == 0:
+            lamp = ((x, y, z), (0, 0, z + 4), 2, None, 100.0)
+        else:
+            lamp = ((x, y, z), (2 * x, 2 * y, z + turn), 60)
+        lamps[f"spot_{i}"] = spot(*lamp)
+        exact += of_spot(*lamp)
+    return scene(lamps), exact
+
+
+@both_variants
+def test_beams_among_other_lamps(variant):
+    """Chosen by the light at the nearest point they would be found too seldom to tell 10 %."""
+    lamps, exact = far_beams()
+    assert_exact(images_of(lamps, max_depth=2), exact, label=f"beams, {variant}")
