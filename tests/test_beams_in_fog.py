@@ -122,7 +122,8 @@ def far_beams():
 
 
 @both_variants
-def test_beams_among_other_lamps(variant):
+@pytest.mark.parametrize("method", ["resampled_tree", "exhaustive", "talk"])
+def test_beams_among_other_lamps(variant, method):
     """Chosen by the light at the nearest point they would be found too seldom to tell 10 %."""
     lamps, exact = far_beams()
-    assert_exact(images_of(lamps, max_depth=2), exact, label=f"beams, {variant}")
+    assert_exact(images_of(lamps, max_depth=2, method=method), exact, label=f"{method}, {variant}")

@@ -54,8 +54,9 @@ public:
                 }
             }
             if (at.extent == Extent::Either)
-                result *= Float(dr::select(
-                    at.length > 0.f, distances_to(tree, at, row).pdf(at.distance), 1.f));
+                result *= Float(
+                    dr::select(at.length > 0.f,
+                               distances_to(at, row, tree.kinds).pdf(at.distance), 1.f));
             result *= Float(m_strategy.with_source<FloatD>([&](const auto &source) {
                 return source.inclusion_probability(tree, at, light, plain(u_tree),
                                                     plain(found));

@@ -16,18 +16,6 @@
 
 namespace manylights {
 
-/// Distances along a segment for a light of the table
-template <typename FloatD>
-SegmentDistances<FloatD> distances_to(const TreeView<FloatD> &tree,
-                                      const Receiver<FloatD> &at,
-                                      const Row<FloatD> &row) {
-    Appearance<FloatD> light = appearance(at, row, tree.kinds);
-    if (!have_beams(tree.kinds))
-        return { at, light.w, light.variance, nullptr };
-    Beam<FloatD> shines = beam(row, tree.kinds);
-    return { at, light.w, light.variance, &shines };
-}
-
 template <typename Float, typename Spectrum> class LightSamples {
 public:
     MI_IMPORT_TYPES(Scene, Emitter, EmitterPtr)
@@ -68,7 +56,7 @@ public:
         Row<FloatD> row = m_lights.tree().row(light, plain(active));
         if (vertex.at.extent == Extent::Point)
             return sample_row_point(vertex, row, inclusion, slot, target_only, active);
-        auto along = distances_to(m_lights.tree(), vertex.at, row);
+        auto along = distances_to(vertex.at, row, m_lights.tree().kinds);
         FloatD t = along.sample(slot_distance(vertex, slot), slot_channel(vertex, slot));
         return at_distance(
             vertex, t, along.pdf(t), target_only, active, [&](const Vertex &v) {

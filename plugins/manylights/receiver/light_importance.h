@@ -8,7 +8,7 @@
 
 #include "lobes.h"
 #include "manylights/kinds/kinds.h"
-#include "segment_view.h"
+#include "segment_distances.h"
 
 namespace manylights {
 
@@ -24,6 +24,31 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
     return appearance<Float>(row, kinds, at.p, least);
 }
 
+/// Distances along a segment for a light of the table
+template <typename Float>
+SegmentDistances<Float> distances_to(const Receiver<Float> &at, const Row<Float> &row,
+                                     KindSet kinds) {
+    Appearance<Float> light = appearance(at, row, kinds);
+    if (!have_beams(kinds))
+        return { at, light.w, light.variance, nullptr };
+    Beam<Float> shines = beam(row, kinds);
+    return { at, light.w, light.variance, &shines };
+}
+
+/// H for a segment: intensity and attenuation in the middle of the angles in which it is lit,
+/// times the integral of 1 / distance^2 over these
+template <typename Float>
+Float segment_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds,
+                         const Float &scale) {
+    auto along            = distances_to(at, row, kinds);
+    Float t               = along.middle();
+    Receiver<Float> moved = at;
+    moved.p -= t * at.wi;
+    Appearance<Float> a = appearance(moved, row, kinds);
+    return row[kBrightness] * scale * a.intensity * along.integral() *
+           attenuation(at, Float(t + dr::norm(a.w)));
+}
+
 /**
  * H of one light: intensity towards x times the receiver's smooth cosine over distance^2,
  * with the light's own extent instead of a cluster's.
@@ -35,13 +60,9 @@ Appearance<Float> appearance(const Receiver<Float> &at, const Row<Float> &row,
 template <typename Float>
 Float light_importance(const Receiver<Float> &at, const Row<Float> &row, KindSet kinds,
                        const Float &scale) {
+    if (at.extent == Extent::Segment)
+        return segment_importance(at, row, kinds, scale);
     Appearance<Float> a = appearance(at, row, kinds);
-    if (at.extent == Extent::Segment) {
-        Float along             = -dr::dot(at.wi, a.w);
-        Receiver<Float> nearest = at;
-        nearest.p -= dr::clip(along, 0.f, at.nearby()) * at.wi;
-        a = appearance(nearest, row, kinds);
-    }
     Float d2 = dr::squared_norm(a.w) + .5f * a.variance + 1e-30f, inv_d = dr::rsqrt(d2);
     Float t = dr::dot(at.n, a.w);
     Float twice =

@@ -54,6 +54,12 @@ public:
         return .5f * (equiangular + transmittance_pdf(m_at, t));
     }
 
+    /// Distance in the middle of the angles
+    Float middle() const { return sample_equiangular(.5f); }
+
+    /// Integral of 1 / distance^2 over the angles
+    Float integral() const { return m_angle / m_view.distance; }
+
     /// Density proportional to a channel's transmittance, or constant if that hardly changes
     static Float sample_transmittance(const Receiver &at, const Float &u,
                                       const UInt32 &channel) {
