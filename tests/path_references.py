@@ -47,9 +47,6 @@ METHODS = (
 MAX_DEPTH = 4
 """Default path depth of the tests: three bounces."""
 
-RARE = ("fog-not-spectral", *(f"phase-{name}" for name in path_scenes.PHASES))
-"""A lamp next to a line of sight has rare bright samples, which the short pilots do not see."""
-
 
 def parameter_id(parameters):
     """A readable test id: `reservoirs=4,shadow_rays=1`."""
@@ -90,8 +87,7 @@ def plugin_images(name, sensor=0, **parameters):
     """Images (seeds, height, width, channels) of the integrator under test."""
     scene = path_scenes.load(name)
     integrator = light_tree(**{"max_depth": depth_of(name), **parameters})
-    error = ERROR["tested"] * (0.5 if name in RARE else 1.0)
-    return planned_images(scene, integrator, error, first_seed=0, sensor=sensor)
+    return planned_images(scene, integrator, ERROR["tested"], first_seed=0, sensor=sensor)
 
 
 def weigh_emitters(name, scene):
