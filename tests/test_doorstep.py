@@ -117,6 +117,12 @@ def test_numbers_of_the_readme_are_those_measured():
         assert cycles == "-" or re.search(rf"\b{re.escape(cycles)}\b", by_hand), cycles
 
 
+def test_readme_of_the_tests_lists_all_of_them():
+    listed = (ROOT / "tests" / "README.md").read_text()
+    files = [path.name for path in (ROOT / "tests").glob("test_*.py")]
+    assert [name for name in files if f"`{name}`" not in listed] == []
+
+
 def test_every_scene_has_a_small_picture_in_the_documentation():
     scenes = [path.stem for path in (ROOT / "scenes").glob("*.xml")]
     scenes += [f"usd_{path.stem}" for path in (ROOT / "scenes" / "usd").glob("*.usda")]
