@@ -90,9 +90,9 @@ def _checked(scene, weights) -> np.ndarray:
         found = np.asarray(weights, float)
     except (TypeError, ValueError):
         found = np.full(count, np.nan)
-    fits = found.shape == (count,) and bool(np.isfinite(found).all() and (found >= 0.0).all())
+    fits = found.shape == (count,) and np.isfinite(found).all() and (found >= 0.0).all()
     what = f"{count} finite numbers of at least 0, one for each emitter, not all of them 0"
-    check("weights", weights, fits and (found.any() or not count), what)
+    check("weights", weights, bool(fits and (found.any() or not count)), what)
     return found
 
 

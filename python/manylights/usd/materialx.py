@@ -134,10 +134,10 @@ class _Inputs:
     def ior(self, name: str, weight: str) -> float:
         """Return the index of refraction whose reflectance is that of ``name`` times a weight."""
         index = self.number(name, 1.5)
-        weight = max(self.number(weight, 1.0), 0.0)
-        if weight == 1.0:
+        factor = max(self.number(weight, 1.0), 0.0)
+        if factor == 1.0:
             return index
-        root = min(abs(index - 1) / (index + 1) * np.sqrt(weight), 0.99)
+        root = min(abs(index - 1) / (index + 1) * np.sqrt(factor), 0.99)
         return float((1 + root) / (1 - root))
 
 

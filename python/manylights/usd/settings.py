@@ -59,8 +59,9 @@ class RenderSettings:
         return products[0] if products else None
 
     def _note_purposes(self) -> None:
-        included, used = self._value("includedPurposes"), self.context.purposes
-        if isinstance(included, Vt.TokenArray) and {*included} != {*used}:
+        value, used = self._value("includedPurposes"), self.context.purposes
+        included = list(value) if isinstance(value, Vt.TokenArray) else None
+        if included is not None and {*included} != {*used}:
             text = f"includedPurposes {', '.join(included)} of the RenderSettings were ignored, "
             text += f"used were {', '.join(used)}: the argument purposes chooses them"
             self.context.notes.add("includedPurposes", text, self.prim)
