@@ -176,7 +176,9 @@ def _scene(context: Context, lights: Lights, drawing: Scenery, camera, default_l
     if not lights.count:
         _without_light(context, scene, default_light)
     if not len(geometry):
-        context.notes.add("no geometry", "nothing that could be seen is in the stage", "/")
+        purposes = ", ".join(context.purposes)
+        text = f"nothing that could be seen is in the stage (of the purposes {purposes})"
+        context.notes.add("no geometry", text, "/")
     scene.notes = context.notes
     scene.metadata = _metadata(context)
     scene.files = layer_files(context.stage)
