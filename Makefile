@@ -71,30 +71,37 @@ soak: $(INSTALLED)  ## Render 10,000 random scenes in child processes: no crash,
 SANITIZED_TESTS := $(addprefix tests/test_,tree.py resampling.py counts.py determinism.py \
                    scene_updates.py robust.py) -k "not memory and not mean"
 
-# Into folder $(1), with more options $(2) of the compiler
-define test_sanitized
-	CXXFLAGS="$(2)" MANYLIGHTS_VARIANTS=scalar_rgb,scalar_spectral $(PIP) install --quiet --upgrade \
-	  --no-deps --no-build-isolation --target $(1)/site -C build-dir=$(1)/objects \
-	  -C cmake.build-type=RelWithDebInfo -C cmake.define.MANYLIGHTS_SANITIZE=ON .
+.PHONY: test-sanitized
+test-sanitized: $(INSTALLED)  ## Run tests with checks of memory access and undefined behaviour (GCC)
+	MANYLIGHTS_VARIANTS=scalar_rgb,scalar_spectral $(PIP) install --quiet --upgrade \
+	  --no-deps --no-build-isolation --target build/sanitized/site \
+	  -C build-dir=build/sanitized/objects -C cmake.build-type=RelWithDebInfo \
+	  -C cmake.define.MANYLIGHTS_SANITIZE=ON .
 	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) \
 	  $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
-	  DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath $(1)/site) \
+	  DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath build/sanitized/site) \
 	  $(BIN)/python -m pytest --capture=sys $(SANITIZED_TESTS) $(ARGS)
-endef
 
-.PHONY: test-sanitized
-test-sanitized: $(INSTALLED)  ## Run tests with checks of memory access and undefined behaviour (GCC)
-	$(call test_sanitized,build/sanitized)
+# Counted are the lines that scalar variants run: others make kernels of them, which LLVM compiles.
+COVERED_TESTS := $(patsubst %,tests/test_%.py,tree resampling sobol counts aovs light_groups plans \
+                   state scene_updates determinism shadow_rays lamps_in_view unsampled_lights \
+                   python_emitters textured_lights bad_input beams_in_fog light_closed_forms \
+                   media_closed_forms path_closed_forms) -k "scalar or not (llvm or memory)"
 
 # On a full disk children cannot write what they have run.
 .PHONY: coverage
-coverage: $(INSTALLED) $(VENV)/.coverage-tools  ## Count the lines that tests run: Python (quick tests), C++ (test-sanitized)
+coverage: $(INSTALLED) $(VENV)/.coverage-tools  ## Count the lines that tests run: Python (all quick ones), C++ (some, scalar)
 	$(BIN)/python -m pytest $(IN_PARALLEL) --cov --cov-report= -k "not full_disk" $(ARGS)
 	$(BIN)/coverage report --skip-covered --sort=cover
 	find build/coverage -name '*.gcda' -delete 2>/dev/null || true
-	$(call test_sanitized,build/coverage,--coverage -fprofile-update=atomic)
-	$(BIN)/gcovr --root . --filter plugins/ --sort uncovered-percent build/coverage/objects
+	CXXFLAGS="-O2 -DNDEBUG --coverage -fprofile-update=atomic" MANYLIGHTS_VARIANTS=scalar_rgb,scalar_spectral \
+	  $(PIP) install --quiet --upgrade --no-deps --no-build-isolation --target build/coverage/site \
+	  -C build-dir=build/coverage/objects -C cmake.build-type=None .
+	DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath build/coverage/site) \
+	  $(BIN)/python -m pytest $(IN_PARALLEL) $(COVERED_TESTS) $(ARGS)
+	$(BIN)/gcovr --root . --filter plugins/ --sort uncovered-percent \
+	  --gcov-ignore-parse-errors=suspicious_hits.warn_once_per_file build/coverage/objects
 
 # Without HOME nothing is taken from Dr.Jit's cache on disk: first renders compile.
 .PHONY: bench
