@@ -100,7 +100,7 @@ coverage: $(INSTALLED) $(VENV)/.coverage-tools  ## Count the lines that tests ru
 	  -C build-dir=build/coverage/objects -C cmake.build-type=None .
 	DRJIT_LIBLLVM_PATH=/nonexistent PYTHONPATH=$(abspath build/coverage/site) \
 	  $(BIN)/python -m pytest $(IN_PARALLEL) $(COVERED_TESTS) $(ARGS)
-	$(BIN)/gcovr --root . --filter plugins/ --sort uncovered-percent \
+	$(BIN)/gcovr --root . --filter plugins/ --merge-lines --sort uncovered-percent \
 	  --gcov-ignore-parse-errors=suspicious_hits.warn_once_per_file build/coverage/objects
 
 # Without HOME nothing is taken from Dr.Jit's cache on disk: first renders compile.
