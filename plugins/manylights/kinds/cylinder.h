@@ -12,6 +12,7 @@ namespace manylights {
 struct CylinderLight {
     static constexpr LightKind kind = LightKind::Cylinder;
     static constexpr bool is_delta  = false;
+    static constexpr bool has_beam  = false;
 
     /// None if it is not circular and upright, of which Mitsuba warns; `e`: what was read of
     /// its emission

@@ -11,6 +11,7 @@ namespace manylights {
 struct DiskLight {
     static constexpr LightKind kind = LightKind::Disk;
     static constexpr bool is_delta  = false;
+    static constexpr bool has_beam  = true;
 
     /// `e`: what was read of its emission
     template <typename Float, typename Spectrum>

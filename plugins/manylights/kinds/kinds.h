@@ -91,8 +91,12 @@ dr::mask_t<Float> is_delta(const Row<Float> &row, KindSet kinds) {
 
 /// Are there lights that shine to one side only, or in a cone?
 inline bool have_beams(KindSet kinds) {
-    return kinds.has(LightKind::Spot) || kinds.has(LightKind::Triangle) ||
-           kinds.has(LightKind::Disk);
+    for (uint32_t i = 0; i < kMostKinds; ++i) {
+        LightKind kind = (LightKind) i;
+        if (kinds.has(kind) && with_kind(kind, [](auto light) { return light.has_beam; }))
+            return true;
+    }
+    return false;
 }
 
 /// Where a light shines

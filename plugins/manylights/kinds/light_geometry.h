@@ -77,6 +77,7 @@ LightPoint<Float> surface_point(const mitsuba::Point<Float, 3> &p, const Float &
 struct WithoutSurface {
     static float diameter(const LightRow &) { return 0; }
 
+    static constexpr bool has_beam = false;
     template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
 
     template <typename Float>

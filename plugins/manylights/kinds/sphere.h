@@ -27,6 +27,7 @@ template <typename Float> struct SphereCone {
 struct SphereLight {
     static constexpr LightKind kind = LightKind::Sphere;
     static constexpr bool is_delta  = false;
+    static constexpr bool has_beam  = false;
 
     /// `e`: what was read of its emission
     template <typename Float, typename Spectrum>

@@ -17,6 +17,7 @@ constexpr float kWidestBeam = .5f;
 /// angle (rad), 1 / (cutoff - beam width)
 struct SpotLight : DeltaLight {
     static constexpr LightKind kind = LightKind::Spot;
+    static constexpr bool has_beam  = true;
 
     /// None if a row cannot hold it: of another shape than a cone, or with a texture
     template <typename Float, typename Spectrum>

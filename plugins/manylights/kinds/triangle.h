@@ -14,6 +14,7 @@ namespace manylights {
 struct TriangleLight {
     static constexpr LightKind kind = LightKind::Triangle;
     static constexpr bool is_delta  = false;
+    static constexpr bool has_beam  = true;
 
     /// The side of a triangle, by its winding, on which it emits: that of the shading normal
     enum class Side { Front, Back, Both };
