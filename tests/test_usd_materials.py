@@ -607,28 +607,25 @@ def test_display_opacity_is_a_mask():
     assert picture(stage_of(square(body)), size=8).mean() == pytest.approx(0.75, abs=0.02)
 
 
-def test_readers_of_display_color_in_a_material():
-    nodes = """def Shader "c" {
+def of_color(primvar):
+    """Return a material whose color is a primvar of surfaces."""
+    nodes = f"""def Shader "c" {{
         uniform token info:id = "UsdPrimvarReader_float3"
-        string inputs:varname = "displayColor"
+        string inputs:varname = "{primvar}"
         float3 inputs:fallback = (.1, .2, .3)
         float3 outputs:result
-    }"""
-    text = preview("color3f inputs:diffuseColor.connect = </m/c.outputs:result>", nodes)
+    }}"""
+    return preview("color3f inputs:diffuseColor.connect = </m/c.outputs:result>", nodes)
+
+
+def test_readers_of_display_color_in_a_material():
+    text = of_color("displayColor")
     body = BOUND + "color3f[] primvars:displayColor = [(.5, .5, .5)]"
     material, _ = material_of(square(body) + text)
     assert principled(material)["base_color"] == {"type": "mesh_attribute", "name": "face_color"}
     material, notes = material_of(square(BOUND) + text)
     assert principled(material)["base_color"]["value"] == pytest.approx([0.1, 0.2, 0.3])
     assert kinds(notes) == ["primvar reader"]
-
-
-COLOR_READER = """def Shader "c" {
-    uniform token info:id = "UsdPrimvarReader_float3"
-    string inputs:varname = "Col"
-    float3 inputs:fallback = (.1, .2, .3)
-    float3 outputs:result
-}"""
 
 
 def seen_colors(folder, text):
@@ -648,7 +645,7 @@ def seen_colors(folder, text):
 @pytest.mark.parametrize("interpolation", ["faceVarying", "vertex", "uniform"])
 def test_a_material_may_read_any_color_of_its_mesh(tmp_path, interpolation):
     """As Blender writes color attributes; displayColor is another one."""
-    text = preview("color3f inputs:diffuseColor.connect = </m/c.outputs:result>", COLOR_READER)
+    text = of_color("Col")
     corners = np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0)], dtype=float)
     values = corners[:1] if interpolation == "uniform" else corners
     listed = ", ".join(str(tuple(value.tolist())) for value in values)
@@ -661,7 +658,7 @@ def test_a_material_may_read_any_color_of_its_mesh(tmp_path, interpolation):
 
 
 def test_a_color_that_the_mesh_does_not_have_is_noted(tmp_path):
-    text = preview("color3f inputs:diffuseColor.connect = </m/c.outputs:result>", COLOR_READER)
+    text = of_color("Col")
     found, notes = seen_colors(tmp_path, square(BOUND) + text)
     assert np.allclose(found, [0.1, 0.2, 0.3]) and "primvar reader" in kinds(notes)
 

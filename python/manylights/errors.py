@@ -80,6 +80,11 @@ def is_integer(value: Any) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool)
 
 
+def is_real(value: Any) -> bool:
+    """Is it a real number of any kind, as of NumPy, and not True or False?"""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 def integer(name: str, value: Any, least: int, most: int) -> int:
     """Return an integer of any kind as one of Python.
 
@@ -97,6 +102,5 @@ def number(name: str, value: Any, allowed: Callable[[Any], bool], what: str) -> 
     Raises:
         UsageError: none, as ``True``, or one that is not allowed; ``what`` says which are.
     """
-    real = isinstance(value, Real) and not isinstance(value, bool)
-    check(name, value, real and allowed(value), what)
+    check(name, value, is_real(value) and allowed(value), what)
     return float(value)

@@ -9,10 +9,9 @@ namespace manylights {
 
 /// The side of a cylinder, sampled uniformly by area. Its row: base[3], axis[3] (of the
 /// cylinder's length), radius, +1 (emits outwards) or -1 (inwards)
-struct CylinderLight {
+struct CylinderLight : WithoutBeam {
     static constexpr LightKind kind = LightKind::Cylinder;
     static constexpr bool is_delta  = false;
-    static constexpr bool has_beam  = false;
 
     /// None if it is not circular and upright, of which Mitsuba warns; `e`: what was read of
     /// its emission
@@ -67,8 +66,6 @@ struct CylinderLight {
     static float diameter(const LightRow &row) {
         return norm(row.geometry + 3) + 2 * row.geometry[6];
     }
-
-    template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
 
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,

@@ -73,12 +73,15 @@ LightPoint<Float> surface_point(const mitsuba::Point<Float, 3> &p, const Float &
 
 // --------------------------------------------------------------------------- Without surface
 
-/// What kinds have in common of whose surface the table knows nothing
-struct WithoutSurface {
-    static float diameter(const LightRow &) { return 0; }
-
+/// What kinds have in common that may shine in all directions
+struct WithoutBeam {
     static constexpr bool has_beam = false;
     template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
+};
+
+/// What kinds have in common of whose surface the table knows nothing
+struct WithoutSurface : WithoutBeam {
+    static float diameter(const LightRow &) { return 0; }
 
     template <typename Float>
     static mitsuba::Vector<Float, 3> normal(const Row<Float> &,

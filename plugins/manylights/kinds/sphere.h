@@ -24,10 +24,9 @@ template <typename Float> struct SphereCone {
 
 /// A sphere, sampled by the cone that it fills, and uniformly by area from within. Its row:
 /// centre[3], radius, +1 (emits outwards) or -1 (inwards)
-struct SphereLight {
+struct SphereLight : WithoutBeam {
     static constexpr LightKind kind = LightKind::Sphere;
     static constexpr bool is_delta  = false;
-    static constexpr bool has_beam  = false;
 
     /// `e`: what was read of its emission
     template <typename Float, typename Spectrum>
@@ -74,8 +73,6 @@ struct SphereLight {
     }
 
     static float diameter(const LightRow &row) { return 2 * row.geometry[3]; }
-
-    template <typename Float> static Beam<Float> beam(const Row<Float> &) { return {}; }
 
     template <typename Float>
     static Appearance<Float> appearance(const Row<Float> &row,

@@ -92,7 +92,7 @@ private:
     /**
      * Let the view be of the part of the segment that is in a beam, if there is any. The cosine of
      * its axis with the direction to nearest + D x is (across + along x) / sqrt(1 + x^2): that of
-     * the beam's border at the roots of a quadratic.
+     * the beam's border at the roots of a quadratic. More than half a sphere is no beam.
      */
     void restrict(const Vector3f &w, const Beam<Float> &beam) {
         Float along  = -dr::dot(beam.axis, m_at.wi),

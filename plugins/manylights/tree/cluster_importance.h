@@ -38,16 +38,39 @@ enum class Directions {
 /// Narrowest beam, as 1 / concentration: what the packed axis can tell
 constexpr float kNarrowestBeam = 1e-3f;
 
+/// |a|^2
+template <typename Float> Four<Float> squared_axis(const Clusters<Float> &c) {
+    return dr::fmadd(c.axis[0], c.axis[0],
+                     dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+}
+
+/**
+ * The von Mises-Fisher lobe of a cluster with beams. Its concentration k follows from the axis'
+ * length r (Banerjee et al. 2005) and from the angle that the cluster fills:
+ *
+ *     1 / k = (1 - r^2) / (r (3 - r^2)) + variance / e^2
+ */
+template <typename Float> struct BeamLobe {
+    using F4 = Four<Float>;
+    F4 inv_r, k, peak;
+
+    /// @param extent  variance / e^2
+    BeamLobe(const F4 &r2, const F4 &extent) {
+        inv_r     = dr::rsqrt(r2 + 1e-8f);
+        F4 spread = (1.f - r2) * inv_r * dr::rcp(3.f - r2) + extent;
+        k         = dr::rcp(max_of(spread, kNarrowestBeam));
+        peak      = 2.f * k * dr::rcp(1.f - dr::exp(-2.f * k));
+    }
+};
+
 /**
  * Emission in the direction -w / |w|, where inv_norm is 1 / e, relative to its mean.
  *
  * Broad: the first harmonics, the last one with 3/4 in place of the 5/8 of a cosine, so that less
  * is left where all lights of a cluster are seen edge-on.
  *
- * Beams: a von Mises-Fisher lobe about the axis whose concentration k follows from the axis'
- * length r (Banerjee et al. 2005) and from the angle that the cluster fills:
+ * Beams: the \ref BeamLobe about the axis,
  *
- *     1 / k = (1 - r^2) / (r (3 - r^2)) + variance / e^2
  *     2 k / (1 - exp(-2 k)) exp(k (o / r - 1))
  */
 template <typename Float>
@@ -56,16 +79,11 @@ Four<Float> emission(const Clusters<Float> &c, const Four<Float> &wx,
                      const Four<Float> &inv_norm, Directions directions) {
     using F4 = Four<Float>;
     F4 o = -dr::fmadd(wx, c.axis[0], dr::fmadd(wy, c.axis[1], wz * c.axis[2])) * inv_norm;
-    F4 r2 = dr::fmadd(c.axis[0], c.axis[0],
-                      dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+    F4 r2 = squared_axis(c);
     if (directions == Directions::Broad)
         return max_of(1.f + 2.f * o + .75f * (3.f * o * o - r2), kEmissionFloor);
-    F4 inv_r = dr::rsqrt(r2 + 1e-8f),
-       spread =
-           (1.f - r2) * inv_r * dr::rcp(3.f - r2) + c.variance * dr::square(inv_norm),
-       k    = dr::rcp(max_of(spread, kNarrowestBeam));
-    F4 peak = 2.f * k * dr::rcp(1.f - dr::exp(-2.f * k));
-    return max_of(peak * dr::exp(k * (o * inv_r - 1.f)), kEmissionFloor);
+    BeamLobe<Float> lobe(r2, c.variance * dr::square(inv_norm));
+    return max_of(lobe.peak * dr::exp(lobe.k * (o * lobe.inv_r - 1.f)), kEmissionFloor);
 }
 
 /**
@@ -80,11 +98,10 @@ template <typename Float>
 Four<Float> segment_emission(const Clusters<Float> &c,
                              const SegmentView<Four<Float>, Float> &view,
                              const Four<Float> &along, const Four<Float> &across,
-                             const Four<Float> &variance, Directions directions) {
+                             const Four<Float> &extent, Directions directions) {
     using F4 = Four<Float>;
     F4 angle = view.angle(), a2 = dr::square(across), b2 = dr::square(along),
-       r2 = dr::fmadd(c.axis[0], c.axis[0],
-                      dr::fmadd(c.axis[1], c.axis[1], c.axis[2] * c.axis[2]));
+       r2 = squared_axis(c);
     if (directions == Directions::Broad) {
         auto [sin_a, cos_a] = view.direction(F4(0.f));
         auto [sin_b, cos_b] = view.direction(F4(view.length));
@@ -97,12 +114,10 @@ Four<Float> segment_emission(const Clusters<Float> &c,
     F4 first = dr::atan2(-view.nearest, view.distance) - dr::atan2(along, across);
     // The turn whose middle is nearest to the axis
     first -= dr::TwoPi<Float> * dr::round((first + .5f * angle) * dr::InvTwoPi<Float>);
-    F4 inv_r  = dr::rsqrt(r2 + 1e-8f),
-       spread = (1.f - r2) * inv_r * dr::rcp(3.f - r2) + variance,
-       k      = dr::rcp(max_of(spread, kNarrowestBeam)),
-       peak = 2.f * k * dr::rcp(1.f - dr::exp(-2.f * k)), o = dr::sqrt(a2 + b2) * inv_r,
-       s = dr::sqrt(.5f * max_of(k * o, 1e-3f)), mean = .5f * dr::sqrt(dr::Pi<Float>) / s;
-    return max_of(peak * dr::exp(k * (o - 1.f)) * mean *
+    BeamLobe<Float> lobe(r2, extent);
+    F4 o = dr::sqrt(a2 + b2) * lobe.inv_r, s = dr::sqrt(.5f * max_of(lobe.k * o, 1e-3f)),
+       mean = .5f * dr::sqrt(dr::Pi<Float>) / s;
+    return max_of(lobe.peak * dr::exp(lobe.k * (o - 1.f)) * mean *
                       (dr::erf(s * (first + angle)) - dr::erf(s * first)),
                   kEmissionFloor * angle);
 }

@@ -128,8 +128,11 @@ def parse_assignments(items: list[str], option: str) -> dict[str, str]:
 
 def called(name: str) -> str:
     """Return what the user calls a parameter of the integrator."""
-    if name in ("aovs", light_groups.PARAMETER):
-        return argument(name)
+    return argument(name) if name in ("aovs", light_groups.PARAMETER) else as_setting(name)
+
+
+def as_setting(name: str) -> str:
+    """Return how the user sets a parameter of the integrator by itself."""
     return typed(f'integrator["{name}"]', f"--set {name}")
 
 
@@ -167,7 +170,7 @@ def joined(settings: dict[str, Any], added: dict[str, Any]) -> dict[str, Any]:
     result = dict(settings)
     for name, value in added.items():
         if name in settings and not isinstance(value, Wish):
-            other = typed(f'integrator["{name}"]', f"--set {name}")
+            other = as_setting(name)
             raise UsageError(f"{argument(name)}: {other} is the same, give one of them")
         result[name] = with_wish(settings.get(name, ""), value)
     return result

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from manylights.errors import is_real
 from manylights.scenes import _build as build
 
 
@@ -95,7 +96,7 @@ def narrow_spots(
         options: ``integrator`` and ``seed``, as for every generator.
     """
     n_lights = build.check_count(n_lights)
-    allowed = build.is_real(cutoff) and 0.0 < cutoff < 90.0
+    allowed = is_real(cutoff) and 0.0 < cutoff < 90.0
     build.check("cutoff", cutoff, allowed, "above 0 and below 90")
     rng = build.random(options.pop("seed", 0))
     position = rng.uniform([-5.0, -4.0, 3.5], [5.0, 6.0, 4.5], (n_lights, 3))

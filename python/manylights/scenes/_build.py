@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from numbers import Real
 
 import mitsuba as mi
 import numpy as np
+
+from manylights.errors import is_real
 
 WARM = (1.0, 0.68, 0.36)
 COOL = (0.72, 0.86, 1.0)
@@ -80,11 +81,6 @@ def check(name: str, value, allowed: bool, what: str) -> None:
     """Raise ValueError with argument, value and what it must be, unless it is allowed."""
     if not allowed:
         raise ValueError(f"{name}={value!r}: must be {what}")
-
-
-def is_real(value) -> bool:
-    """Is it a real number, of Python or NumPy?"""
-    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def random(seed: int) -> np.random.Generator:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from manylights.errors import is_real
 from manylights.scenes import _build as build
 from manylights.scenes._build import Quads
 from manylights.scenes._city import city
@@ -129,9 +130,9 @@ def fog_rooms(
 
 def _in_fog(description: dict, low, high, mean_free_path: float, g: float) -> dict:
     """Return the scene with a box of fog, given by two corners, around the camera."""
-    allowed = build.is_real(mean_free_path) and mean_free_path > 0.0
+    allowed = is_real(mean_free_path) and mean_free_path > 0.0
     build.check("mean_free_path", mean_free_path, allowed, "above 0")
-    build.check("g", g, build.is_real(g) and -1.0 < g < 1.0, "above -1 and below 1")
+    build.check("g", g, is_real(g) and -1.0 < g < 1.0, "above -1 and below 1")
     low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
     center, half = 0.5 * (low + high), 0.5 * (high - low)
     fog = {"type": "ref", "id": "fog"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from manylights.errors import is_real
 from manylights.scenes import _build as build
 from manylights.scenes._build import Quads
 
@@ -175,7 +176,7 @@ def glossy(
             sampling handles that one only. Default: False.
     """
     n_lights = build.check_count(n_lights)
-    allowed = build.is_real(roughness) and 0.0 < roughness <= 1.0
+    allowed = is_real(roughness) and 0.0 < roughness <= 1.0
     build.check("roughness", roughness, allowed, "above 0 and at most 1")
     build.require_variant()
     rng = build.random(seed)

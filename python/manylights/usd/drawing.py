@@ -17,6 +17,7 @@ from manylights.usd.lights import Lights
 from manylights.usd.materials import Materials
 from manylights.usd.mitsuba_meshes import checked_uv
 from manylights.usd.shining import MOST_TRIANGLES, Glow, MeshLight, add_lamps, glow_of, world_areas
+from manylights.usd.stage import targets_of
 from manylights.usd.surface import Surface
 from manylights.usd.traversal import Batch, Item
 
@@ -172,8 +173,7 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
         for item in batch.items:
             drawn.add(item.prim.GetPath())
             if item.prim.GetTypeName() == "GeometryLight":
-                relation = item.prim.GetRelationship("geometry")
-                for target in relation.GetForwardedTargets() if relation else ():
+                for target in targets_of(item.prim, "geometry"):
                     if result.get(target, item.prim) != item.prim:
                         text = f"{target} is the geometry of several lights: it has the last one's"
                         context.notes.add("geometry light", text, item.prim)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from manylights.usd.context import Context
+from manylights.usd.stage import targets_of
 
 #: Where materials are looked for, see ``Materials.bound``.
 PURPOSES = (UsdShade.Tokens.full, UsdShade.Tokens.preview, UsdShade.Tokens.allPurpose)
@@ -32,8 +33,7 @@ class InstanceKeys:
 
     def point_to(self, light: Usd.Prim) -> None:
         """Remember what a ``GeometryLight`` shines from."""
-        relation = light.GetRelationship("geometry")
-        for target in relation.GetForwardedTargets() if relation else ():
+        for target in targets_of(light, "geometry"):
             self.targets.update(target.GetPrefixes())
 
     def apart(self, instances: list[tuple]) -> list[list[tuple]]:

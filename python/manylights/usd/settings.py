@@ -7,6 +7,7 @@ import math
 from pxr import Sdf, Usd, UsdRender, Vt
 
 from manylights.usd.context import Context
+from manylights.usd.stage import targets_of
 
 #: More pixels than this along a side are a slip.
 LARGEST_SIDE = 65536
@@ -48,8 +49,7 @@ class RenderSettings:
 
     def _first_product(self) -> Usd.Prim | None:
         """Return the product whose image is rendered, note others with another camera."""
-        relation = self.prim.GetRelationship("products") if self.prim else None
-        targets = relation.GetForwardedTargets() if relation else ()
+        targets = targets_of(self.prim, "products") if self.prim else ()
         prims = [self.context.stage.GetPrimAtPath(path) for path in targets]
         products = [prim for prim in prims if prim and prim.IsA(UsdRender.Product)]
         if len({_camera_of(product) for product in products}) > 1:
@@ -169,9 +169,7 @@ class RenderSettings:
 
 def _camera_of(prim: Usd.Prim) -> Sdf.Path | None:
     """Return the path of the camera of settings or a product."""
-    relation = prim.GetRelationship("camera")
-    targets = relation.GetForwardedTargets() if relation else ()
-    return targets[0] if targets else None
+    return next(iter(targets_of(prim, "camera")), None)
 
 
 def _plain(value):

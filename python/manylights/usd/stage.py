@@ -71,6 +71,12 @@ def guarded(path):
         delegate.TakeUncoalescedDiagnostics()
 
 
+def targets_of(prim: Usd.Prim, name: str) -> list[Sdf.Path]:
+    """Return the targets of a prim's relationship, none if it has no such one."""
+    relation = prim.GetRelationship(name)
+    return relation.GetForwardedTargets() if relation else []
+
+
 def time_of(stage: Usd.Stage, time: float | None) -> Usd.TimeCode:
     """Return the time to read at: as asked for, else the authored start, else the default."""
     if isinstance(time, Usd.TimeCode):
