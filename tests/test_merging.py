@@ -203,6 +203,24 @@ def test_lamps_to_keep_and_lamps_that_others_refer_to_stay(scalar):
     mi.load_dict(manylights.merge_emitters(scene))
 
 
+def test_a_shape_to_keep_that_is_not_there_is_refused_with_those_near(scalar):
+    scene = {
+        "type": "scene",
+        **lamps(),
+        "floor": mi.load_dict(lamp(0, 1.0)),
+        "grey": diffuse(1, 1, 1),
+    }
+    scene["group"] = {"type": "shapegroup", "inner": lamp(0, 1.0)}
+    for known in ("lamp_1", "floor", "group", "group.inner"):
+        manylights.merge_emitters(scene, keep=[known])
+    wrong = "keep 'lmp_1': the scene has no shape of this id, near ones are lamp_1, lamp_"
+    with pytest.raises(ValueError, match=wrong):
+        manylights.merge_emitters(scene, keep=["lamp_0", "lmp_1"])
+    for other in ("grey", "zz", 3):
+        with pytest.raises(ValueError, match=rf"keep '?{other}'?: .*, it has lamp_0, .*floor"):
+            manylights.merge_emitters(scene, keep={other})
+
+
 def test_what_is_no_description_is_named(scalar):
     for wrong in (None, "scene.xml", mi.load_dict({"type": "scene"})):
         with pytest.raises(ValueError, match=r"must be a dictionary for mi\.load_dict"):

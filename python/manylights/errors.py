@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from numbers import Integral, Real
 from typing import Any
 
@@ -20,6 +21,9 @@ OPTIONS = {
 
 #: Characters of a value in a message, at most.
 MOST_SHOWN = 60
+
+#: Names that a message lists, at most.
+MOST_NAMES = 8
 
 _in_shell = False
 
@@ -73,6 +77,21 @@ def check(name: str, value: Any, allowed: bool, what: str) -> None:
     """Raise ``UsageError`` with argument, value and what it must be, unless it is allowed."""
     if not allowed:
         raise UsageError(f"{argument(name)} {shown(value)}: must be {what}")
+
+
+def near(name: Any, known: Iterable[str]) -> str:
+    """Return, for a message, which of the known names are like one that is not known.
+
+    >>> near("lamp_7", ["floor", "lamp_1", "lamp_2"])
+    'near ones are lamp_2, lamp_1'
+    >>> near("sun", ["floor", "lamp_1"])
+    'it has floor, lamp_1'
+    """
+    known = list(dict.fromkeys(known))
+    if alike := get_close_matches(str(name), known):
+        return f"near {'ones are' if len(alike) > 1 else 'is'} {', '.join(alike)}"
+    more = ", ..." if len(known) > MOST_NAMES else ""
+    return f"it has {', '.join(known[:MOST_NAMES]) or 'none'}{more}"
 
 
 def is_integer(value: Any) -> bool:

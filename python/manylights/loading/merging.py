@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from manylights.errors import check
+from manylights.errors import UsageError, argument, check, near, shown
 from manylights.loading import light_groups, parsing
 from manylights.loading.integrators import leaf_integrators
 from manylights.loading.ours import PARAMETERS
@@ -45,7 +45,7 @@ MESH_PARAMETERS = (
 MESH_CHILDREN = ("bsdf.", "emitter.", "interior_medium.", "exterior_medium.")
 
 Reference = mi.Properties.ResolvedReference
-INTEGRATOR = mi.ObjectType.Integrator
+INTEGRATOR, SHAPE = mi.ObjectType.Integrator, mi.ObjectType.Shape
 
 
 class MergedScene(dict):
@@ -121,7 +121,7 @@ def merge_emitters(scene: dict, keep=()) -> MergedScene:
 
     Raises:
         ValueError: the scene's integrator is one of Mitsuba's: it would lose light. Or the scene is
-            not a dictionary, or ``keep`` not a list.
+            not a dictionary, ``keep`` not a list, or a shape in it not in the scene.
     """
     require_variant()
     check("scene", scene, isinstance(scene, dict), "a dictionary for mi.load_dict")
@@ -130,6 +130,8 @@ def merge_emitters(scene: dict, keep=()) -> MergedScene:
     config = mi.parser.ParserConfig(mi.variant())
     state = mi.parser.parse_dict(config, scene)
     _check_integrators(state)
+    keep = list(keep)
+    _check_shapes(state, keep)
     indices = state.id_to_index
     keep = {*keep, *_referred_shapes(state, indices)}
     definitions = {key: _index(state.root.props, key) for key, _ in state.root.props.items()}
@@ -205,6 +207,20 @@ def _check_integrators(state) -> None:
                 f"merge_emitters: the integrator {name} finds no light on merged emitters, "
                 f"use {' or '.join(PARAMETERS)}"
             )
+
+
+def _check_shapes(state, ids: list) -> None:
+    """Refuse ids to keep that no shape of the scene has, as its key or as its own."""
+    keys = sorted((index, name) for name, index in state.id_to_index.items())
+    known = [name for index, name in keys if state.nodes[index].type == SHAPE]
+    known += [node.props.id() for node in state.nodes if node.type == SHAPE]
+    items = state.root.props.items()
+    known += [key for key, value in items if isinstance(value, mi.Shape)]
+    known = dict.fromkeys(filter(None, known))
+    for name in ids:
+        if not isinstance(name, str) or name not in known:
+            what = f"{argument('keep')} {shown(name)}: the scene has no shape of this id"
+            raise UsageError(f"{what}, {near(name, known)}")
 
 
 def _index(props, key: str) -> int | None:
