@@ -346,6 +346,7 @@ def assert_fails(capsys, arguments, *words):
         (("city:10,colour=red",), ("city:10,colour=red", "colour")),
         (("city:10,integrator=depth",), ("city:10,integrator=depth", "volpath")),
         ((CITY, "-D", "width=9"), ("-D width: no SCENE is an XML file",)),
+        ((CITY, "--camera", "/eye"), ("--camera: no SCENE is a USD stage",)),
         ((CITY, "--methods", "best"), ("--methods best", "uniform", "exhaustive")),
         ((CITY, "--methods", "talk:speed=2"), ("--methods talk:speed=2", "splitting_rate")),
         ((CITY, "--methods", "talk:splitting_rate=-2"), ("--methods talk", "splitting_rate", "-2")),

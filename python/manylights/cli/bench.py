@@ -17,7 +17,8 @@ from manylights.bench import (
     standard,
 )
 from manylights.cli import options as shared
-from manylights.errors import UsageError
+from manylights.errors import UsageError, argument
+from manylights.loading.parsing import USD_ENDINGS
 from manylights.output import denoise
 from manylights.progress import run_with_bar, say
 
@@ -139,8 +140,11 @@ def _tasks(options) -> list[runner.Task]:
         UsageError: no scene, an unknown one, an unknown method, a reference for several scenes.
     """
     defines, stage = shared.defines(options), shared.usd_options(options)
-    if defines and not any(text.lower().endswith(".xml") for text in options.scene + options.also):
+    names = [text.lower() for text in options.scene + options.also]
+    if defines and not any(name.endswith(".xml") for name in names):
         raise UsageError(f"-D {next(iter(defines))}: no SCENE is an XML file, only these have them")
+    if stage.given() and not any(name.endswith((".xml", *USD_ENDINGS)) for name in names):
+        raise UsageError(f"{argument(stage.given()[0])}: no SCENE is a USD stage, that is for them")
     chosen = _methods(options.methods)
     tasks = standard.standard() if options.standard else standard.quick() if options.quick else []
     if chosen is not None:

@@ -43,6 +43,11 @@ class UsdOptions:
     blender_light_units: bool = False
     light_groups: str = ""
 
+    def given(self) -> list[str]:
+        """Return which arguments that stages alone have are not the default."""
+        names = [known.name for known in fields(self) if known.name != "light_groups"]
+        return [name for name in names if getattr(self, name) != getattr(UsdOptions, name)]
+
 
 @dataclass
 class ParsedScene:
@@ -95,10 +100,8 @@ def parse(
         options = usd_options or UsdOptions()
         groups = light_groups or options.light_groups
         return _parse_usd(path, defines or {}, replace(options, light_groups=groups))
-    for known in fields(UsdOptions):
-        given = getattr(usd_options, known.name, known.default)
-        if given != known.default and known.name != "light_groups":
-            raise UsageError(f"{argument(known.name)}: {path} is XML, that is for USD stages")
+    if usd_options and (given := usd_options.given()):
+        raise UsageError(f"{argument(given[0])}: {path} is XML, that is for USD stages")
     config = mi.parser.ParserConfig(mi.variant())
     try:
         state = mi.parser.parse_file(config, str(path), **(defines or {}))
