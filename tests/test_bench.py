@@ -365,6 +365,14 @@ def test_bad_input_is_named(capsys, tmp_path, arguments, words):
     assert_fails(capsys, (*arguments, "--out", tmp_path / "out", *out), *words)
 
 
+def test_a_reference_in_the_folder_of_results_stays(capsys, copy):
+    path = next(copy.glob("*/reference.exr"))
+    before = path.read_bytes()
+    words = (CITY, *FEW, "--out", copy, "--reference", path)
+    assert_fails(capsys, words, f"--reference {path}: is in the folder --out {copy}")
+    assert path.read_bytes() == before
+
+
 def test_broken_scene(capsys, tmp_path):
     path = tmp_path / "broken.xml"
     path.write_text('<scene version="3.0.0"><shape')

@@ -1,7 +1,9 @@
 """Files that renders leave: channels and attributes, as other programs read them, too."""
 
+import pathlib
 import subprocess
 import sys
+import types
 
 import manylights
 import mitsuba as mi
@@ -200,6 +202,62 @@ def test_info_names_files_of_others(tmp_path, capsys):
     assert cli.main(["info", str(tmp_path / "none.exr")]) == 2
     told = capsys.readouterr().err
     assert "other.exr: no render of manylights" in told and "none.exr: no such file" in told
+
+
+@pytest.mark.parametrize("by", ["name", "folder", "link"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("merge", "a.exr", "b.exr", "-o", "OUT"),
+        ("merge", "b.exr", "a.exr", "-o", "OUT", "--partial"),
+        ("mix", "a.exr", "key=2", "-o", "OUT"),
+        ("compare", "a.exr", "b.exr", "-o", "OUT"),
+        ("compare", "b.exr", "b.exr", "--reference", "a.exr", "-o", "OUT"),
+        ("report", ".", "-o", "OUT"),
+    ],
+)
+def test_a_file_that_is_read_is_not_written_over(command, by, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (name,) = {"compare": ["a.png"], "report": ["results.json"]}.get(command[0], ["a.exr"])
+    content = '{"manylights_bench": 1}' if name == "results.json" else "mine"
+    for path in (name, "b.exr"):
+        (tmp_path / path).write_text(content)
+    out = {"name": name, "folder": f"../{tmp_path.name}/{name}", "link": f"link{name[1:]}"}[by]
+    (tmp_path / f"link{name[1:]}").symlink_to(name)
+    words = [out if word == "OUT" else word.replace("a.exr", name) for word in command]
+    monkeypatch.setattr("manylights.bench.records.load", _nothing_measured)
+    assert cli.main(words) == 2
+    message = capsys.readouterr().err
+    assert f"-o {out}: would overwrite a file that is read" in message
+    assert (by == "name") == (f"({name})" not in message) or command[0] == "report"
+    assert (tmp_path / name).read_text() == content
+
+
+def _nothing_measured(folder):
+    return types.SimpleNamespace(folder=pathlib.Path(folder))
+
+
+@pytest.mark.parametrize("name", ["wood.exr", "wood.png"])
+def test_a_render_does_not_write_over_a_file_of_its_scene(name, tmp_path):
+    texture = tmp_path / name
+    pixels = mi.Bitmap(np.full((2, 2, 3), 128, np.uint8 if name[-1] == "g" else np.float32))
+    pixels.write(str(texture))
+    before = texture.read_bytes()
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        f"""<scene version="3.0.0"><sensor type="perspective"/><emitter type="constant"/>
+        <shape type="rectangle"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+        <string name="filename" value="{name}"/></texture></bsdf></shape></scene>"""
+    )
+    with pytest.raises(UsageError, match=rf"wood.{name[-3:]}'?: would overwrite a file"):
+        manylights.render(str(path), spp=1, output=tmp_path / "wood.exr")
+    assert texture.read_bytes() == before
+
+
+def test_an_image_that_is_its_own_checkpoint_stays(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    manylights.render(scene(), spp=1, output="a.exr", checkpoint=tmp_path / "a.exr")
+    assert (tmp_path / "a.exr").is_file()
 
 
 def test_images_without_a_name_for_layers_are_as_before(tmp_path):

@@ -6,6 +6,7 @@ import glob
 import os
 import tempfile
 import threading
+from collections.abc import Iterable
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -47,6 +48,29 @@ def check_output(path: str, kind: str = "", ending: str = "", named: bool = True
             return target
     except OSError as error:
         raise UsageError(f"{name}{path}: not writable ({error.strerror})") from error
+
+
+def is_same(path: str | Path, other: str | Path) -> bool:
+    """Are both the same file, perhaps by links? One that is not there is not."""
+    try:
+        return os.path.samefile(path, other)
+    except OSError:
+        return False
+
+
+def check_apart(target: Path, sources: Iterable[str | Path]) -> None:
+    """Check that what is written is none of the files that are read.
+
+    Raises:
+        UsageError: it is.
+    """
+    for source in sources:
+        if is_same(target, source):
+            name = "" if str(source) == str(target) else f" ({source})"
+            raise UsageError(
+                f"{argument('output')} {target}: would overwrite a file that is read{name}, "
+                "choose another name"
+            )
 
 
 #: Held while a file is written; who ends the process takes it first.

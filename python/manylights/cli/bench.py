@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from pathlib import Path
 
 from manylights import loading
 from manylights.bench import (
@@ -159,6 +160,11 @@ def _tasks(options) -> list[runner.Task]:
         return tasks
     if len(tasks) != 1:
         raise UsageError(f"--reference {options.reference}: needs one SCENE, not {len(tasks)}")
+    if Path(options.out).resolve() in Path(options.reference).resolve().parents:
+        raise UsageError(
+            f"--reference {options.reference}: is in the folder --out {options.out}, pictures of "
+            "which are written anew, choose another folder"
+        )
     # Errors against another reference are other numbers: the scene is measured again.
     source = tasks[0].source
     digest = f"{source.fingerprint} {reference.fingerprint(options.reference)}"

@@ -66,12 +66,13 @@ def _run(options) -> int:
     mi.set_variant("scalar_rgb")
     names = [options.first, options.second]
     names += [options.reference] if options.reference else []
-    pictures = [channels.read_colors(name) for name in names]
-    for name, picture in zip(names, pictures):
-        compare.check_size(picture, name, pictures[0], names[0])
     target = None
     if options.output:
         target = files.check_output(options.output, "the picture is a PNG file", ".png")
+        files.check_apart(target, names)
+    pictures = [channels.read_colors(name) for name in names]
+    for name, picture in zip(names, pictures):
+        compare.check_size(picture, name, pictures[0], names[0])
     found, equal = compare.compare(*pictures, threshold=options.threshold, trim=options.trim)
     if target is not None:
         compare.write_picture(pictures[0], pictures[-1], target)

@@ -85,7 +85,7 @@ def merge(
 
     Raises:
         UsageError: (a ``ValueError``) a file that cannot be read or is of another render, a part
-            that comes twice, or one that is missing and ``partial`` is not set.
+            that comes twice, one that is missing and ``partial`` is not set, or the output.
         RuntimeError: no variant of Mitsuba is set.
     """
     require_variant()
@@ -98,6 +98,8 @@ def merge(
     paths = [files.path_of("paths", path) for path in paths]
     if not paths:
         raise UsageError("nothing to merge: no files")
+    if target is not None:
+        files.check_apart(target, paths)
     first, bitmap = state_file.read(paths[0], WHAT, "")
     if first.state is None:
         return _merge_images(first, bitmap, paths[1:], target, denoise, exposure)

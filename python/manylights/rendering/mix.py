@@ -60,7 +60,8 @@ def mix(
         exposure: stops by which the PNG is brighter, from -64 to 64.
 
     Raises:
-        UsageError: (a ``ValueError``) no render of ours, no such group, a wrong weight.
+        UsageError: (a ``ValueError``) no render of ours, no such group, a wrong weight, or
+            the output is the same file.
         RuntimeError: there is an output, and no variant of Mitsuba is set.
     """
     target = None if output is None else images.check_output(str(output))
@@ -68,6 +69,8 @@ def mix(
         require_variant()
     images.check_stops(exposure)
     path = files.path_of("path", path)
+    if target is not None:
+        files.check_apart(target, [path])
     check("weights", weights, isinstance(weights, Mapping), "a dictionary of factors by group")
     planes, attributes = exr.read(path)
     groups = light_groups.groups(planes)

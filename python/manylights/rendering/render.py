@@ -142,8 +142,17 @@ def render(
     return _finished(job, state, store, facts, target, wanted)
 
 
+def _check_apart(target: Path | None, job: Job) -> None:
+    """Check that neither the image nor its preview is a file of the scene, a texture as a rule."""
+    if target is not None:
+        path = target if job.part is None else part_path(target, job.part)
+        for written in (path, path.with_suffix(".png")):
+            files.check_apart(written, job.loaded.files)
+
+
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
     """Return the facts that files need, and the state that the render goes on from."""
+    _check_apart(target, job)
     check(
         "learnt", learnt, learnt is None or job.part is not None, f"given with {argument('part')}"
     )
@@ -209,7 +218,7 @@ def _finished(
             wanted.exposure,
         )
         result.notes += notes
-    if store is not None and store.path not in result.files:
+    if store is not None and not any(files.is_same(store.path, file) for file in result.files):
         store.remove()
     return result
 

@@ -40,6 +40,7 @@ def write_report(folder: str, output: str | None, publish: bool) -> tuple[Path, 
     """
     data = records.load(folder)
     target = files.check_output(output or str(data.folder / PAGE_NAME))
+    files.check_apart(target, [data.folder / records.FILE])
     text, remarks = render(data, publish)
     with files.written_whole(target) as partial:
         partial.write_text(text, encoding="utf-8")
