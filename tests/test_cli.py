@@ -520,6 +520,60 @@ def test_messages_name_what_was_typed_in_python_or_in_the_shell(
     assert not list(tmp_path.glob("*.exr"))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("--workers local:2 --for 10m", "workers: need a number of samples or a noise"),
+        ("--part 1/2 --for 10m", "part 1 of 2: needs a fixed number of samples"),
+        ("--part 1/2 --until-noise 0.1", "part 1 of 2: needs a fixed number of samples"),
+        ("--part 1/2 --exposure 1", "--exposure 1.0: must be left out with --part"),
+        ("--part 1/2 --learnt no.exr", "--learnt no.exr: no such file"),
+        ("--learnt scene.xml", "--learnt scene.xml: must be given with --part"),
+        ("--ship", "--ship: must be given with --workers"),
+        ("--integrator path --aov uv", "--aov: path shows no surfaces"),
+        ("--integrator path --light-groups a=b", "--light-groups: path has none"),
+        ("--integrator manylights_direct --set max_depth=3", "--set max_depth: manylights_direct"),
+        ("--set hide_emitters=false --hide-lights", "--hide-lights: --set hide_emitters is the"),
+        ("--tev a:b", "--tev a:b: must be HOST:PORT"),
+        ("--workers local:2 --time 3", "--time: scene.xml is XML"),
+        ("--workers local:2 SCENE=no.xml", "no.xml: no such file"),
+        ("--workers local:2 SCENE=stage.usda -D a=1", "-D a: stage.usda is USD"),
+    ],
+)
+def test_what_the_command_line_rules_out_is_refused_before_anything_is_begun(
+    scene, tmp_path, monkeypatch, capsys, arguments, words
+):
+    from manylights.rendering import workers
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.xml").write_bytes(scene.read_bytes())
+    (tmp_path / "stage.usda").write_text("#usda 1.0\n")
+    for module, name in ((package.loading, "load"), (workers, "Connection")):
+        monkeypatch.setattr(module, name, lambda *_: pytest.fail("begun"))
+    given = arguments.split()
+    name = next((word[6:] for word in given if word.startswith("SCENE=")), "scene.xml")
+    given = [word for word in given if not word.startswith("SCENE=")]
+    command = ["render", name, "-o", "o.exr", "--variant", "scalar_rgb", *given]
+    assert cli.main(command) == 2
+    assert f"manylights: {words}" in capsys.readouterr().err
+
+
+def test_what_arguments_rule_out_is_refused_before_the_scene_is_loaded(scene, monkeypatch):
+    require_variant("scalar_rgb")
+    monkeypatch.setattr(package.loading, "as_loaded", lambda *_: pytest.fail("begun"))
+    for wrong in (
+        {"part": (1, 2), "seconds": 1.0},
+        {"part": (3, 2)},
+        {"client": object(), "seconds": 1.0},
+        {"ship": True},
+        {"learnt": "a.exr"},
+        {"part": (1, 2), "learnt": "no.exr"},
+        {"tev": "a:b"},
+    ):
+        with pytest.raises(UsageError):
+            package.render(scene, spp=1, **wrong)
+
+
 def test_notes_say_how_to_undo_a_choice_in_python_or_in_the_shell(scene, tmp_path, capsys):
     require_variant("scalar_rgb")
     notes = package.render(scene, spp=1).notes

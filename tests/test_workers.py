@@ -414,7 +414,7 @@ def test_without_dask_the_error_says_what_to_type(scene, tmp_path, monkeypatch, 
 
 def test_ship_needs_workers(scene, tmp_path, capsys):
     assert cli.main(["render", str(scene), "-o", str(tmp_path / "a.exr"), "--ship"]) == 2
-    assert "--ship: there are no --workers" in capsys.readouterr().err
+    assert "--ship: must be given with --workers" in capsys.readouterr().err
 
 
 # -------------------------------------------------------------------------------------- who listens

@@ -17,6 +17,7 @@ OPTIONS = {
     "aovs": "--aov",
     "seconds": "--for",
     "client": "--workers",
+    "hide_emitters": "--hide-lights",
 }
 
 #: Characters of a value in a message, at most.

@@ -11,9 +11,10 @@ from manylights import loading
 from manylights.cli import options as shared
 from manylights.errors import UsageError
 from manylights.loading import ours
-from manylights.output import channels, denoise, images
+from manylights.output import channels, images
 from manylights.progress import NOTHING_WRITTEN, Bar, run_with_bar, say, waiting
 from manylights.rendering import Progress, RenderResult, live, render
+from manylights.rendering.arguments import check_together
 from manylights.rendering.checkpoint import path_for
 from manylights.rendering.extras import Extras
 from manylights.rendering.parts import Part
@@ -21,6 +22,12 @@ from manylights.rendering.render import part_path
 
 #: Seconds between two writings of a checkpoint of workers, if nobody asks for one.
 CHECKPOINT_SECONDS = 60.0
+
+#: Options that exclude or need each other.
+TOGETHER = ("part", "until_noise", "seconds", "learnt", "ship")
+
+#: Those of what is shown beside the image.
+SHOWN = ("denoise", "exposure", "tev")
 
 HELP = """\
 examples:
@@ -233,31 +240,31 @@ def _run(options) -> None:
     settings = ours.parse_assignments(options.set, "--set")
     settings = {name: ours.parse_value(text) for name, text in settings.items()}
     if options.hide_lights:
-        settings["hide_emitters"] = True
-    if options.denoise:
-        denoise.check_installed()
-    extras = Extras(options.aov, options.light_groups, options.denoise)
+        settings = ours.joined(settings, {"hide_emitters": True})
+    given = {name: getattr(options, name) for name in ("light_groups", *SHOWN)}
+    extras = Extras.of({"aovs": options.aov, **given}, options.part)
     settings = ours.joined(settings, extras.parameters())
+    together = {name: getattr(options, name) for name in TOGETHER}
+    check_together(client=options.workers, **together)
     shared.start(options)
+    arguments = (options.scene, defines, options.integrator, settings)
+    arguments += (shared.usd_options(options), options.sampler)
+    loading.check_arguments(*arguments)
     if options.workers is None:
-        if options.ship:
-            raise UsageError("--ship: there are no --workers to send files to")
-        _load_and_render(options, target, defines, settings)
+        _load_and_render(options, target, arguments)
         return
     if options.checkpoint is None:
         options.checkpoint = CHECKPOINT_SECONDS
     from manylights.rendering import workers
 
     with workers.Connection(options.workers, options.threads) as connection:
-        _load_and_render(options, target, defines, settings, connection)
+        _load_and_render(options, target, arguments, connection)
 
 
-def _load_and_render(options, target: Path, defines, settings, connection=None) -> None:
-    stage = shared.usd_options(options)
+def _load_and_render(options, target: Path, arguments: tuple, connection=None) -> None:
+    """Render what ``loading.load`` makes of its arguments."""
     with waiting("loading"):
-        loaded = loading.load(
-            options.scene, defines, options.integrator, settings, stage, options.sampler
-        )
+        loaded = loading.load(*arguments)
     for note in loaded.notes:
         say(note)
     count = len(loaded.scene.sensors())
@@ -267,8 +274,7 @@ def _load_and_render(options, target: Path, defines, settings, connection=None) 
             f"--sensor {options.sensor}: {has}" if count else f"{options.scene}: has no sensor"
         )
     names = ("spp", "seed", "sensor", "until_noise", "seconds", "threads")
-    names += ("denoise", "exposure", "tev")
-    wanted = {name: getattr(options, name) for name in names}
+    wanted = {name: getattr(options, name) for name in (*names, *SHOWN)}
     wanted |= {"part": _part(options), "learnt": options.learnt}
     if options.checkpoint is not None:
         path = part_path(target, options.part) if options.part else path_for(target)

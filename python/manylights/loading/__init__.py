@@ -11,7 +11,7 @@
 """
 
 from manylights.loading import light_groups
-from manylights.loading.load import LoadedScene, as_loaded, load
+from manylights.loading.load import LoadedScene, as_loaded, check_arguments, load
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
@@ -27,6 +27,7 @@ __all__ = [
     "ParsedScene",
     "UsdOptions",
     "as_loaded",
+    "check_arguments",
     "default_variant",
     "files_of",
     "has_backend",

@@ -221,17 +221,14 @@ def _about_media(state, old: str, new: str) -> list[str]:
     return [f"integrator: shadow rays of {old} end on surfaces of {passed}, those of {new} do not"]
 
 
-def _apply(props, settings: dict[str, Any]) -> None:
-    plugin = props.plugin_name()
-    if plugin not in PARAMETERS and "aovs" in settings:
-        if isinstance(settings["aovs"], Wish):
-            settings = {name: value for name, value in settings.items() if name != "aovs"}
-        else:
+def check_settings(plugin: str, settings: dict[str, Any]) -> None:
+    """Raise ``UsageError`` for parameters that an integrator cannot have, as far as we know it."""
+    for name, value in settings.items():
+        if name == "aovs" and plugin not in PARAMETERS and not isinstance(value, Wish):
             known = " or ".join(PARAMETERS)
             raise UsageError(
                 f"{argument('aovs')}: {plugin} shows no surfaces, {known} do{by_name()}"
             )
-    for name, value in settings.items():
         if plugin in PARAMETERS and name not in (*PARAMETERS[plugin], *BASE_PARAMETERS):
             known = "; ".join(f"{key} ({what})" for key, what in PARAMETERS[plugin].items())
             raise UsageError(f"{called(name)}: {plugin} has no such parameter. It has: {known}")
@@ -240,6 +237,15 @@ def _apply(props, settings: dict[str, Any]) -> None:
             raise UsageError(f"{argument(name)}: {plugin} has none, {known} have{by_name()}")
         if plugin in PARAMETERS and name in PARAMETERS[plugin]:
             check_type(name, value, PARAMETERS[plugin][name])
+
+
+def _apply(props, settings: dict[str, Any]) -> None:
+    plugin = props.plugin_name()
+    check_settings(plugin, settings)
+    for name, value in settings.items():
+        # What is only wished for, other plugins do without.
+        if plugin not in PARAMETERS and isinstance(value, Wish):
+            continue
         props[name] = with_wish(props.get(name, ""), value)
 
 

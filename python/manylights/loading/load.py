@@ -14,6 +14,7 @@ from manylights.loading import integrators, light_groups, merging, ours, sampler
 from manylights.loading.parsing import (
     ParsedScene,
     UsdOptions,
+    check_file,
     instantiate,
     parse,
     parse_description,
@@ -69,13 +70,7 @@ def load(
         UsageError: (a ``ValueError``) no such file, or an argument that is something else.
         RuntimeError: Mitsuba cannot read or make the scene.
     """
-    for name, value in (("integrator", integrator), ("sampler", sampler)):
-        check(name, value, value is None or isinstance(value, str), "the name of a plugin")
-    for name, value, kind, what in (
-        ("settings", settings, dict, "a dictionary"),
-        ("usd_options", usd_options, UsdOptions, "UsdOptions"),
-    ):
-        check(name, value, value is None or isinstance(value, kind), what)
+    check_arguments(path, defines, integrator, settings, usd_options, sampler)
     with search_beside(path), threads_for_files():
         groups = light_groups.as_text((settings or {}).get(light_groups.PARAMETER, ""))
         parsed = parse(path, defines, usd_options, groups)
@@ -86,6 +81,27 @@ def load(
     loaded.arguments = {"path": path, "defines": defines, "integrator": integrator}
     loaded.arguments |= {"settings": settings, "usd_options": usd_options, "sampler": sampler}
     return loaded
+
+
+def check_arguments(
+    path: str,
+    defines: dict[str, str] | None = None,
+    integrator: str | None = None,
+    settings: dict | None = None,
+    usd_options: UsdOptions | None = None,
+    sampler: str | None = None,
+) -> None:
+    """Raise ``UsageError`` for arguments that ``load`` refuses whatever the scene is."""
+    for name, value in (("integrator", integrator), ("sampler", sampler)):
+        check(name, value, value is None or isinstance(value, str), "the name of a plugin")
+    for name, value, kind, what in (
+        ("settings", settings, dict, "a dictionary"),
+        ("usd_options", usd_options, UsdOptions, "UsdOptions"),
+    ):
+        check(name, value, value is None or isinstance(value, kind), what)
+    check_file(path, defines, usd_options)
+    if integrator not in (None, "keep"):
+        integrators.check_settings(integrator, settings or {})
 
 
 def load_description(

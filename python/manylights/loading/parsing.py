@@ -88,20 +88,11 @@ def parse(
             ``defines`` for a stage or options of stages for XML.
         RuntimeError: Mitsuba cannot read it.
     """
-    path_of("path", path)
-    check("defines", defines, defines is None or isinstance(defines, dict), "a dictionary")
-    if not Path(path).is_file():
-        folder = path and Path(path).is_dir()
-        what = "is a folder, not a scene" if folder else "no such file"
-        raise UsageError(f"{path or shown(path)}: {what}")
-    if Path(path).suffix.lower() in IMAGE_ENDINGS:
-        raise UsageError(f"{path}: is an image, not a scene (an XML file or a USD stage)")
-    if Path(path).suffix.lower() in USD_ENDINGS:
+    check_file(path, defines, usd_options)
+    if _is_stage(path):
         options = usd_options or UsdOptions()
         groups = light_groups or options.light_groups
-        return _parse_usd(path, defines or {}, replace(options, light_groups=groups))
-    if usd_options and (given := usd_options.given()):
-        raise UsageError(f"{argument(given[0])}: {path} is XML, that is for USD stages")
+        return _parse_usd(path, replace(options, light_groups=groups))
     config = mi.parser.ParserConfig(mi.variant())
     try:
         state = mi.parser.parse_file(config, str(path), **(defines or {}))
@@ -115,11 +106,36 @@ def parse(
     return ParsedScene(config, state, files_of(state))
 
 
-def _parse_usd(path: str, defines: dict[str, str], options: UsdOptions) -> ParsedScene:
-    if defines:
-        raise UsageError(
-            f"{argument('defines')} {next(iter(defines))}: {path} is USD, only XML has <default>"
-        )
+def check_file(
+    path: str, defines: dict[str, str] | None = None, usd_options: UsdOptions | None = None
+) -> None:
+    """Check what the name of a scene's file tells, without reading it: arguments of ``parse``.
+
+    Raises:
+        UsageError: as ``parse``.
+    """
+    path_of("path", path)
+    check("defines", defines, defines is None or isinstance(defines, dict), "a dictionary")
+    if not Path(path).is_file():
+        folder = path and Path(path).is_dir()
+        what = "is a folder, not a scene" if folder else "no such file"
+        raise UsageError(f"{path or shown(path)}: {what}")
+    if Path(path).suffix.lower() in IMAGE_ENDINGS:
+        raise UsageError(f"{path}: is an image, not a scene (an XML file or a USD stage)")
+    if _is_stage(path):
+        if defines:
+            name = f"{argument('defines')} {next(iter(defines))}"
+            raise UsageError(f"{name}: {path} is USD, only XML has <default>")
+        import_usd(path)
+    elif usd_options and (given := usd_options.given()):
+        raise UsageError(f"{argument(given[0])}: {path} is XML, that is for USD stages")
+
+
+def _is_stage(path: str) -> bool:
+    return Path(path).suffix.lower() in USD_ENDINGS
+
+
+def _parse_usd(path: str, options: UsdOptions) -> ParsedScene:
     description = import_usd(path).load(path, **asdict(options))
     parsed = parse_description(description)
     # A stage composes layers that no node of the scene names.

@@ -9,6 +9,7 @@
 - ``parts``: which steps each of several machines has;
 - ``state_file``, ``checkpoint``: the state in a file, and when it is written;
 - ``workers``: the same steps by several processes and machines;
+- ``arguments``: which of them exclude each other, before anything is loaded;
 - ``render``: puts these together, and ``merge`` what several have rendered;
 - ``mix``: other images of one with layers of light groups.
 """

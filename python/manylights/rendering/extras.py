@@ -63,6 +63,8 @@ class Extras:
         images.check_stops(extras.exposure)
         tev = extras.tev
         check("tev", tev, tev is None or isinstance(tev, str), "a text, HOST:PORT")
+        if tev is not None:
+            live.check(tev)
         for name in ("denoise", "exposure"):
             value = getattr(extras, name)
             whole = not value or part is None

@@ -96,7 +96,7 @@ class Job:
         _check_groups(driver)
         part = Part.of(part)
         if part is not None:
-            _check_part(part, driver, noise, seconds)
+            _check_part(part, driver)
         if spp is None:
             aimless = noise is None and seconds is None
             spp = driver.sensor.sampler().sample_count() if aimless else MOST_SPP
@@ -194,14 +194,8 @@ def differences(old: dict[str, Any], new: dict[str, Any], but: tuple[str, ...] =
     return changes
 
 
-def _check_part(part: Part, driver: Driver, noise, seconds) -> None:
+def _check_part(part: Part, driver: Driver) -> None:
     """Raise ``UsageError`` if parts of this cannot be added."""
-    if noise is not None or seconds is not None:
-        target = "noise" if noise is not None else "time"
-        raise UsageError(
-            f"{part.words()}: needs a fixed number of samples. With a {target} as the target each "
-            "step depends on what all those before have given"
-        )
     film = driver.sensor.film().class_name()
     if film not in FILMS:
         raise UsageError(f"{part.words()}: parts of a {film} cannot be merged, only of an hdrfilm")

@@ -14,6 +14,20 @@ HOST, PORT = "localhost", 14158
 MISSING = "needs the package tevclient, type: pip install 'manylights[tev]'"
 
 
+def check(address: str) -> None:
+    """Raise ``UsageError`` if the address is none or tevclient is missing; nobody is asked."""
+    _parse(address)
+    _client()
+
+
+def _client():
+    try:
+        from tevclient import Ipc
+    except ImportError as error:
+        raise UsageError(f"{argument('tev')}: {MISSING}") from error
+    return Ipc
+
+
 class Viewer:
     """A picture in tev.
 
@@ -67,11 +81,7 @@ class Viewer:
             say(f"tev: does not answer ({error.strerror or error}), the render goes on without")
 
     def _connection(self):
-        try:
-            from tevclient import Ipc
-        except ImportError as error:
-            raise UsageError(f"{argument('tev')}: {MISSING}") from error
-        return Ipc(*self.address)
+        return _client()(*self.address)
 
 
 def _parse(address: str) -> tuple[str, int]:

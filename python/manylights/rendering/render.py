@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from manylights import files, loading
-from manylights.errors import UsageError, argument, check, integer, number
+from manylights.errors import UsageError, check, integer, number
 from manylights.output import channels, images
 from manylights.rendering import checkpoint as checkpoints
 from manylights.rendering import metadata, state_file
+from manylights.rendering.arguments import check_together
 from manylights.rendering.checkpoint import Checkpoint
 from manylights.rendering.develop import develop
 from manylights.rendering.extras import Extras
@@ -132,13 +133,13 @@ def render(
         RuntimeError: Mitsuba or a worker cannot read or render the scene.
     """
     target = None if output is None else images.check_output(str(output))
-    wanted = Extras.of(extras, part)
+    part, wanted = Part.of(part), Extras.of(extras, part)
+    check_together(part, until_noise, seconds, learnt, client, ship)
     loaded, own = loading.as_loaded(scene, integrator, wanted.parameters())
     job = Job.of(loaded, sensor, spp, seed, until_noise, seconds, own, part)
     store = None if checkpoint is None else _store(checkpoint, job, checkpoint_seconds)
     facts, state = _begin(job, store, target, learnt)
-    watch = wanted.prepare(job, target)
-    _work(job, state, store, facts, progress or (lambda _: None), watch, threads, client, ship)
+    _work(job, state, store, facts, progress, wanted.prepare(job, target), threads, client, ship)
     return _finished(job, state, store, facts, target, wanted)
 
 
@@ -153,9 +154,6 @@ def _check_apart(target: Path | None, job: Job) -> None:
 def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any], State]:
     """Return the facts that files need, and the state that the render goes on from."""
     _check_apart(target, job)
-    check(
-        "learnt", learnt, learnt is None or job.part is not None, f"given with {argument('part')}"
-    )
     # Before the render, which may change the scene's parameters.
     facts = store.facts if store else job.facts() if target or learnt else {}
     state = (store and store.restore()) or State.empty(job.course.sequences)
@@ -166,9 +164,9 @@ def _begin(job: Job, store, target: Path | None, learnt) -> tuple[dict[str, Any]
 
 def _work(job: Job, state: State, store, facts, progress, watch, threads, client, ship) -> None:
     """Render what the state does not have, here or with workers."""
+    progress = progress or (lambda _: None)
     check("progress", progress, callable(progress), "a function")
     threads = None if threads is None else integer("threads", threads, 1, MOST_THREADS)
-    check("ship", ship, not ship or client is not None, "given with client")
     if client is None:
         with thread_count(threads):
             run(job, state, store, progress, watch=watch)

@@ -61,11 +61,6 @@ def check_job(job: Job, client) -> None:
     """Raise ``UsageError`` if workers cannot render a job."""
     fits = not getattr(client, "asynchronous", True)
     check("client", client, fits, "a synchronous distributed.Client")
-    if job.course.seconds is not None:
-        raise UsageError(
-            "workers: need a number of samples or a noise. With a time as the target each step "
-            "depends on how long the one before took"
-        )
     film = job.film.class_name()
     if film not in FILMS:
         raise UsageError(f"workers: films of a {film} cannot be added, only of an hdrfilm")
