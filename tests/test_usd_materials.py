@@ -10,9 +10,9 @@ pytest.importorskip("pxr")
 import mitsuba as mi
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from manylights.usd.copies import copies
 from manylights.usd.geometry import surfaces_of
 from manylights.usd.materials import Materials
-from manylights.usd.mitsuba_meshes import in_world, join, kind_of, mesh_of
 from manylights.usd.textures import scaled
 from pxr import Usd, UsdUtils
 
@@ -23,6 +23,8 @@ from tests.usd_surfaces import (
     area_vectors,
     context_of,
     kinds,
+    material_on,
+    mesh_of,
     meshes_of,
     only,
     picture,
@@ -91,7 +93,7 @@ def material_of(text, folder=None, path="/a"):
     stage = stage_of(text, folder)
     context = context_of(stage)
     surface = surfaces_of(stage.GetPrimAtPath(path), context)[0]
-    return Materials(context).of(surface), context.notes
+    return material_on(surface, Materials(context)), context.notes
 
 
 def principled(material):
@@ -302,7 +304,7 @@ def test_images_are_upright_and_not_mirrored(tmp_path, variant):
 
 @pytest.mark.parametrize("planted", [lambda uv: uv, lambda uv: 1 - uv])
 def test_planted_mirrors_are_found(tmp_path, monkeypatch, planted):
-    monkeypatch.setattr("manylights.usd.mitsuba_meshes.to_mitsuba_uv", planted)
+    monkeypatch.setattr("manylights.usd.copies.to_mitsuba_uv", planted)
     assert shown_quarters(tmp_path) != pytest.approx(QUARTERS, abs=0.5)
 
 
@@ -414,7 +416,7 @@ def test_images_in_packages_are_read(tmp_path):
     stage = Usd.Stage.Open(package)
     context = context_of(stage)
     surface = surfaces_of(stage.GetPrimAtPath("/a"), context)[0]
-    material = Materials(context).of(surface)
+    material = material_on(surface, Materials(context))
     assert texel(material.emission, 0.25, 0.75) == pytest.approx([1, 0, 0], abs=1e-3)
     assert not context.notes
 
@@ -480,9 +482,11 @@ def test_emission_above_one_in_spectra_and_its_scale(tmp_path, variant, textured
     assert image == pytest.approx([20, 5, 0.5], rel=0.05)
     context = context_of(stage)
     surface = surfaces_of(stage.GetPrimAtPath("/a"), context)[0]
-    material = Materials(context).of(surface)
+    material = material_on(surface, Materials(context))
     half = {
-        "m": mesh_of(surface, material, context, None, "m", scaled(material.emission, [0.5, 1, 2]))
+        "m": mesh_of(
+            surface, material, context, np.eye(4), "m", scaled(material.emission, [0.5, 1, 2])
+        )
     }
     image = picture(stage_of(""), light=0, entries=half).mean(axis=(0, 1))
     assert image == pytest.approx([10, 5, 1], rel=0.05)
@@ -731,7 +735,7 @@ def test_only_the_emissive_subset_shines():
     stage = stage_of(text)
     context = context_of(stage)
     surfaces = surfaces_of(stage.GetPrimAtPath("/a"), context)
-    materials = [Materials(context).of(surface) for surface in surfaces]
+    materials = [material_on(surface, Materials(context)) for surface in surfaces]
     flux = [
         np.pi * area(s) * m.emission["value"][0] for s, m in zip(surfaces, materials) if m.emission
     ]
@@ -946,7 +950,8 @@ def test_shaders_of_mitsuba_become_their_dictionaries(tmp_path):
     assert nested["diffuse_reflectance"]["filename"] == str(tmp_path / "q.exr")
     matrix = np.array(nested["diffuse_reflectance"]["to_uv"].matrix)
     assert matrix == pytest.approx(np.array([[2, 0, 5], [0, 3, 0], [0, 0, 1]]))
-    assert material.bsdf_object() is material.bsdf_object() and not notes
+    assert not notes
+    mi.load_dict(material.bsdf)
 
 
 # --- meshes ---
@@ -963,7 +968,7 @@ def test_outsides_stay_outside_under_any_matrix(matrix):
     if abs(determinant) < 0.05:
         return
     ball = only('def Sphere "a" {}')
-    moved = in_world(ball, matrix)
+    moved = copies(ball, None, matrix.T[None])
     assert volume(moved) == pytest.approx(abs(determinant) * volume(ball), rel=1e-3)
     outside = np.einsum("mi,mki->mk", area_vectors(moved), moved.normals[moved.faces])
     # The flat triangles of a squeezed ball are a little off its normals
@@ -978,25 +983,6 @@ def test_mirrored_lamps_shine_to_their_outside():
     for from_z, expected in ((1, 2), (-1, 0)):
         image = picture(stage_of(text), size=4, from_z=from_z, light=0, emission=True)
         assert image.mean() == pytest.approx(expected)
-
-
-def test_joined_surfaces_keep_area_colors_and_places():
-    body = 'color3f[] primvars:displayColor = [(.2, .4, .6)] (\ninterpolation = "uniform"\n)'
-    stage = stage_of(square(body + ST))
-    context = context_of(stage)
-    one = surfaces_of(stage.GetPrimAtPath("/a"), context)[0]
-    material = Materials(context).of(one)
-    shift = np.eye(4)
-    shift[0, 3] = 10
-    other = in_world(one, shift)
-    assert kind_of(one, material) == kind_of(other, material)
-    both = join([one, other], material)
-    assert area(both) == pytest.approx(8) and len(both.colors) == 4
-    assert both.positions[:, 0].max() == pytest.approx(11)
-    assert both.uv == pytest.approx(np.concatenate([one.uv, one.uv]))
-    mesh = mesh_of(both, material, context, name="both")
-    assert mesh.face_count() == 4 and mesh.id() == "both"
-    assert mesh.surface_area() == pytest.approx(8)
 
 
 def test_meshes_with_zero_normals_have_those_of_their_faces():
@@ -1029,7 +1015,7 @@ INPUTS = (
 def test_no_input_of_a_surface_breaks_the_reader(inputs):
     lines = "\n".join(text.format(f"inputs:{name}") for name, text in inputs.items())
     material, _ = material_of(square() + preview(lines))
-    material.bsdf_object()
+    mi.load_dict(material.bsdf)
     if material.emission:
         mi.load_dict({"type": "area", "radiance": material.emission})
 

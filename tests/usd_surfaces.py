@@ -7,9 +7,10 @@ import itertools
 import mitsuba as mi
 import numpy as np
 from manylights.usd.context import Context
+from manylights.usd.copies import copies
 from manylights.usd.geometry import surfaces_of
 from manylights.usd.materials import Materials
-from manylights.usd.mitsuba_meshes import mesh_of
+from manylights.usd.mitsuba_meshes import checked_uv
 from pxr import Usd
 
 _numbers = itertools.count()
@@ -90,13 +91,26 @@ def kinds(notes):
     return [note.kind for note in notes]
 
 
+def material_on(surface, materials):
+    """Return what Mitsuba makes of the material that a surface is bound to."""
+    return materials.make(materials.bound(surface.binding), surface)
+
+
+def mesh_of(surface, material, context, matrix, name, emission=None):
+    """Return a surface as Mitsuba's mesh, in the world that the columns of a matrix lead to."""
+    surface.uv = checked_uv(surface, material, context)
+    shape = copies(surface, material.bsdf, np.asarray(matrix).T[None])
+    shape.radiance = emission
+    return shape.instantiate(name, {})
+
+
 def meshes_of(stage, time=None, emission=False, **choices):
     """Return Mitsuba's meshes of a whole stage as entries of a scene, and the notes."""
     context = context_of(stage, time, **choices)
     materials, result = Materials(context), {}
     for prim in stage.Traverse():
         for surface in surfaces_of(prim, context):
-            material = materials.of(surface)
+            material = material_on(surface, materials)
             matrix = np.array(context.transforms.GetLocalToWorldTransform(prim)).T
             name = f"mesh{len(result)}"
             light = material.emission if emission else None

@@ -14,6 +14,7 @@ from pxr import Sdf, Usd
 
 from manylights.errors import UsageError, argument
 from manylights.loading.light_groups import entry_of
+from manylights.output.light_groups import REST
 
 #: Paths that an error lists.
 MOST_PATHS = 8
@@ -88,7 +89,7 @@ class LightGroups:
         """Raise ``UsageError`` if the domes that become one environment are in several entries."""
         entries, found = self.text.split(","), {}
         for member in filter(None, members):
-            name = "rest" if member.entry is None else entries[member.entry]
+            name = REST if member.entry is None else entries[member.entry]
             found.setdefault(name, member.name)
         if len(found) > 1:
             listed = " and ".join(f"{path} in {name}" for name, path in found.items())

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from pxr import UsdShade
 
@@ -49,12 +48,6 @@ class Material:
     lookups: list[Lookup] = field(default_factory=list)
     prim: Any = None
 
-    def bsdf_object(self):
-        """Return Mitsuba's BSDF, the same one for all meshes."""
-        if not hasattr(self, "_bsdf"):
-            self._bsdf = mi.load_dict(self.bsdf)
-        return self._bsdf
-
 
 class Materials:
     """The materials of a stage, each made once."""
@@ -63,14 +56,6 @@ class Materials:
         self.context, self.textures = context, Textures(context)
         self._looks: dict[str, object] = {}
         self._made: dict[tuple, Material] = {}
-
-    def of(self, surface) -> Material:
-        """Return the material of a surface, that of its colors where none is bound."""
-        return self.make(self.bound(surface.binding), surface)
-
-    def bsdf(self, prim) -> Material:
-        """Return the material that a prim is bound to, grey if there is none."""
-        return self.make(self.bound(prim), None)
 
     def color_primvar(self, material) -> str | None:
         """Return the primvar that the colors of a USD material are, ``None`` if there is none."""
