@@ -191,3 +191,14 @@ def test_paths_fit_whole_and_by_their_names():
     ]:
         assert (entry_of(f"x={pattern}", name) == 0) == fits, (pattern, name)
         assert (core.light_group(f"x={pattern}", name)[0] == 0) == fits, (pattern, name)
+
+
+def test_lights_of_several_groups_on_one_geometry_are_noted(tmp_path):
+    light = 'def GeometryLight "NAME" {;rel geometry = </quad>;};'
+    text = light.replace("NAME", "a") + light.replace("NAME", "b")
+    text += f'def Mesh "quad" {{;{FACES}}};' + bulb("b_too", 0)
+    scene = manylights.usd.load(write_stage(tmp_path, text), light_groups="x=/a,y=/b*")
+    texts = [note.text for note in scene.notes if note.kind == "geometry light groups"]
+    assert len(texts) == 1 and "/quad" in texts[0]
+    scene = manylights.usd.load(write_stage(tmp_path, text), light_groups="x=/[ab]")
+    assert not [note for note in scene.notes if note.kind == "geometry light groups"]

@@ -567,11 +567,46 @@ def test_geometry_light_makes_its_geometry_shine(load):
     assert "/none" in note(load(light.replace("/quad", "/none")), "geometry light")
 
 
-def test_geometry_of_several_lights_is_noted(load):
-    light = 'def GeometryLight "NAME" {;rel geometry = </quad>;float inputs:intensity = 6;}'
-    lights = light.replace("NAME", "a") + light.replace("NAME", "b")
-    scene = load(f'{lights};def Mesh "quad" {{;{QUAD}{placed()}}}')
-    assert "/quad" in note(scene, "geometry light") and "/b" in note(scene, "geometry light")
+def geometry_lights(*inputs):
+    """Return the text of GeometryLights on /quad, each with its inputs."""
+    text = 'def GeometryLight "l{}" {{;rel geometry = </quad>;{}}};'
+    return "".join(text.format(index, part) for index, part in enumerate(inputs))
+
+
+def test_lights_of_one_geometry_add_up(load):
+    matrix = row_matrix(np.diag([2.0, 1, 1]))
+    lights = geometry_lights(
+        "float inputs:intensity = 6;",
+        "float inputs:intensity = 3;color3f inputs:color = (0, 1, 0);",
+        "float inputs:intensity = 8;bool inputs:normalize = true;",
+        "float inputs:intensity = 0;",
+    )
+    scene = load(f'{lights}def Mesh "quad" {{;{QUAD}{matrix_op(matrix)}}}')
+    # 6 of the first, 8 over an area of 2 of the third
+    assert_irradiance(scene, seen(SURFACES["RectLight"](matrix)) * np.array([10, 13, 10]))
+    assert not note(scene, "geometry light")
+
+
+def test_a_mesh_light_and_those_that_point_to_it_add_up(load):
+    lights = geometry_lights("float inputs:intensity = 6;")
+    scene = load(lights + mesh_light("float inputs:intensity = 4;" + placed(), bound=True))
+    assert_irradiance(scene, per_area() * np.array([10, 8, 7]))
+
+
+def test_lights_that_point_to_a_light_with_a_picture_are_noted(load, tmp_path):
+    mi.Bitmap(np.full((2, 2, 3), 2.0, np.float32)).write(str(tmp_path / "p.exr"))
+    text = mesh_light(placed()).replace(
+        "color3f inputs:emissiveColor = (1, 0.5, 0.25)",
+        "color3f inputs:emissiveColor.connect = </glow/picture.outputs:rgb>",
+    )
+    picture = 'def Shader "picture" { ; uniform token info:id = "UsdUVTexture"'
+    picture += "; asset inputs:file = @p.exr@; color3f outputs:rgb; }"
+    text = text.replace('def Shader "shader"', f'{picture}; def Shader "shader"')
+    scene = load(text)
+    assert_irradiance(scene, per_area() * np.array([2, 2, 2]))
+    scene = load(geometry_lights("float inputs:intensity = 6;") + text)
+    assert_irradiance(scene, per_area() * np.array([2, 2, 2]))
+    assert "/quad" in note(scene, "geometry light")
 
 
 # -- What cannot be carried over

@@ -6,7 +6,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
-from pxr import Tf, Usd, UsdLux
+from pxr import Sdf, Tf, Usd, UsdLux
 
 from manylights.usd.context import Context, Notes
 from manylights.usd.copies import copies
@@ -16,7 +16,15 @@ from manylights.usd.light_shapes import transform
 from manylights.usd.lights import Lights
 from manylights.usd.materials import Materials
 from manylights.usd.mitsuba_meshes import checked_uv
-from manylights.usd.shining import MOST_TRIANGLES, Glow, MeshLight, add_lamps, glow_of, world_areas
+from manylights.usd.shining import (
+    MOST_TRIANGLES,
+    Glow,
+    MeshLight,
+    add_lamps,
+    glow_of,
+    together,
+    world_areas,
+)
 from manylights.usd.stage import targets_of
 from manylights.usd.surface import Surface
 from manylights.usd.traversal import Batch, Item
@@ -83,13 +91,13 @@ class Scenery:
             _give_color(surfaces, batch.color)
         worlds = batch.worlds(item)
         self._corners += [_box(surface.positions, worlds) for surface in surfaces]
-        light = self._light(item.prim)
+        lights = self._lights(item.prim)
         quiet, shining = [], []
         for surface, material in zip(surfaces, bound):
             material = self.materials.make(material, surface)
             surface.uv = checked_uv(surface, material, self.context)
-            glow = light.glow(surface, material) if light else glow_of(surface, material)
-            if glow is None or not glow.radiance.any():
+            glow = self._glow(item.prim, lights, surface, material)
+            if glow is None or not glow.shines():
                 quiet.append((item, surface, material))
             else:
                 shining.append((surface, glow))
@@ -110,12 +118,22 @@ class Scenery:
                 surfaces = [replace(part, color_primvar=name) for part in colored]
         return surfaces, bound
 
-    def _light(self, prim: Usd.Prim) -> MeshLight | None:
-        """Return the light that a geometry is."""
-        if prim.HasAPI(UsdLux.LightAPI):
-            return MeshLight(prim, self.context, tints=True)
-        pointing = self._pointed.get(prim.GetPath())
-        return MeshLight(pointing, self.context, tints=False) if pointing else None
+    def _lights(self, prim: Usd.Prim) -> list[MeshLight]:
+        """Return the lights that a geometry is: its own, and those that point to it."""
+        own = [MeshLight(prim, self.context, tints=True)] if prim.HasAPI(UsdLux.LightAPI) else []
+        pointing = self._pointed.get(prim.GetPath(), [])
+        return own + [MeshLight(light, self.context, tints=False) for light in pointing]
+
+    def _glow(self, prim: Usd.Prim, lights: list[MeshLight], surface, material) -> Glow | None:
+        """Return what a surface emits, ``None`` for nothing."""
+        if not lights:
+            return glow_of(surface, material)
+        glows = [light.glow(surface, material) for light in lights]
+        if len(glows) > 1 and glows[0].texture is not None:
+            text = "the light of a mesh shows a picture: lights that point to it were left out"
+            self.context.notes.add("geometry light", text, prim)
+            return glows[0]
+        return together(glows)
 
     def _shine(self, batch, item, surfaces, shining: list[tuple[Surface, Glow]]) -> None:
         prim, worlds = item.prim, batch.worlds(item)
@@ -125,14 +143,17 @@ class Scenery:
             self.context.notes.add("instances", text, prim, len(worlds))
             return
         areas = None
-        if any(glow.normalize for _, glow in shining):
+        if any(glow.normalized.any() for _, glow in shining):
             areas = world_areas(surfaces, worlds)
             if not (areas > 0).all():
                 text = "a light with a zero area was left out"
                 self.context.notes.add("area", text, prim, int((areas <= 0).sum()))
-        pointing = self._pointed.get(prim.GetPath())
-        others = (*([pointing.GetPath()] if pointing else []), *batch.instancers)
-        member = self.context.light_groups.of(prim, others)
+        pointing, groups = self._pointed.get(prim.GetPath(), []), self.context.light_groups
+        if groups and len({groups.entry_of(str(light.GetPath())) for light in pointing}) > 1:
+            text = "lights of several light groups shine from one geometry: all are in the first"
+            self.context.notes.add("geometry light groups", text, prim)
+        others = (*(light.GetPath() for light in pointing), *batch.instancers)
+        member = groups.of(prim, others)
         for surface, glow in shining:
             for mesh in add_lamps(self.lights.lamps, surface, glow, worlds, areas, member):
                 if mesh.light:
@@ -166,7 +187,7 @@ class Scenery:
             }
 
 
-def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
+def _geometry_lights(context: Context, batches: list[Batch]) -> dict[Sdf.Path, list[Usd.Prim]]:
     """Return the ``GeometryLight`` prims by the path of the geometry that they point to."""
     result, drawn = {}, set()
     for batch in batches:
@@ -174,12 +195,10 @@ def _geometry_lights(context: Context, batches: list[Batch]) -> dict:
             drawn.add(item.prim.GetPath())
             if item.prim.GetTypeName() == "GeometryLight":
                 for target in targets_of(item.prim, "geometry"):
-                    if result.get(target, item.prim) != item.prim:
-                        text = f"{target} is the geometry of several lights: it has the last one's"
-                        context.notes.add("geometry light", text, item.prim)
-                    result[target] = item.prim
-    for target, prim in result.items():
-        if target not in drawn:
+                    found = result.setdefault(target, [])
+                    found += [item.prim] if item.prim not in found else []
+    for target, prims in result.items():
+        for prim in prims if target not in drawn else ():
             text = f"a GeometryLight points to {target}, which is not drawn"
             context.notes.add("geometry light", text, prim)
     return result

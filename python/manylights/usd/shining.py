@@ -32,17 +32,21 @@ class Glow:
 
     Attributes:
         radiance: three factors of the texture.
+        normalized: three more, to divide by the area of the whole prim in the world.
         texture: a dictionary for Mitsuba, ``None`` for a constant radiance.
-        normalize: divide by the area of the whole prim in the world?
         bsdf: a dictionary for Mitsuba, ``None`` if it does not reflect.
         needs_mesh: whether emission or reflection vary over the surface.
     """
 
     radiance: np.ndarray
+    normalized: np.ndarray
     texture: dict | None
-    normalize: bool
     bsdf: dict | None
     needs_mesh: bool
+
+    def shines(self) -> bool:
+        """Is there any light?"""
+        return bool(self.radiance.any() or self.normalized.any())
 
 
 class MeshLight:
@@ -75,7 +79,8 @@ class MeshLight:
             text = "the material of a mesh light glows independently: only the light was read"
             self.context.notes.add("tint", text, self.inputs.prim)
         varies = texture is not None or (bsdf is not None and _varies(surface, material))
-        return Glow(self.radiance * tint, texture, self.normalize, bsdf, varies)
+        parts = (np.zeros(3), self.radiance * tint)
+        return Glow(*(parts if self.normalize else parts[::-1]), texture, bsdf, varies)
 
 
 def glow_of(surface: Surface, material) -> Glow | None:
@@ -86,7 +91,13 @@ def glow_of(surface: Surface, material) -> Glow | None:
     if not radiance.any():
         return None
     varies = texture is not None or _varies(surface, material)
-    return Glow(radiance, texture, False, material.bsdf, varies)
+    return Glow(radiance, np.zeros(3), texture, material.bsdf, varies)
+
+
+def together(glows: list[Glow]) -> Glow:
+    """Return the light of several lights on a surface, which reflects as with the first."""
+    sums = (sum(glow.radiance for glow in glows), sum(glow.normalized for glow in glows))
+    return replace(glows[0], radiance=sums[0], normalized=sums[1])
 
 
 def _varies(surface: Surface, material) -> bool:
@@ -167,9 +178,9 @@ def add_lamps(
         member: of a group of lights. Default: there are none.
     """
     radiance = np.broadcast_to(glow.radiance, (len(worlds), 3))
-    if glow.normalize:
+    if glow.normalized.any():
         inverse = np.divide(1.0, areas, out=np.zeros_like(areas), where=areas > 0)
-        radiance = radiance * inverse[:, None]
+        radiance = radiance + glow.normalized * inverse[:, None]
     if surface.double_sided:
         surface = two_sided(surface)
     if glow.texture is not None and surface.uv is None:
