@@ -262,6 +262,22 @@ NAMELESS = """<scene version="3.0.0">
 """
 
 
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("", "The scene has 2 lights without an id."),
+        ('<emitter type="point" id="key"/>', 'has 3 lights: "key" and 2 without an id.'),
+        ('<shape type="cube"><emitter type="area" id="glow"/></shape>', ': "glow" and 2 without'),
+        ('<emitter type="point" id="a_{}"/>' * 9, r'has 11 lights: .*a_7", \.\.\. and 2 with'),
+    ],
+)
+def test_lights_without_an_id_are_counted(scalar, more, words):
+    more = more.format(*range(9))
+    scene = mi.load_string(NAMELESS.replace("</scene>", f"{more}</scene>"))
+    with pytest.raises(RuntimeError, match=words):
+        rendered(scene, {"type": "manylights_direct", "light_groups": "a=lamp"})
+
+
 def test_lights_without_ids_are_told(scalar, tmp_path, capsys):
     path = tmp_path / "scene.xml"
     path.write_text(NAMELESS)

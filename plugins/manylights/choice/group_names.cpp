@@ -135,6 +135,23 @@ uint32_t GroupNames::group_of(size_t entry) const {
                        m_groups.begin());
 }
 
+std::string list_of_lights(const std::vector<std::string> &names) {
+    constexpr size_t most = 8;
+    std::string listed;
+    size_t named = 0;
+    for (const std::string &name : names)
+        if (!name.empty() && ++named <= most)
+            listed += (named == 1 ? ": \"" : ", \"") + name + "\"";
+    listed += named > most ? ", ..." : "";
+    std::string count =
+        std::to_string(names.size()) + (names.size() == 1 ? " light" : " lights");
+    if (named == names.size())
+        return count + listed;
+    std::string rest = " without an id";
+    return named ? count + listed + " and " + std::to_string(names.size() - named) + rest
+                 : count + rest;
+}
+
 std::vector<std::string> group_channels(const GroupNames &names) {
     std::vector<std::string> result;
     for (const std::string &group : names.groups())

@@ -53,6 +53,9 @@ private:
     std::vector<std::string> m_groups;
 };
 
+/// Lights for an error: how many there are and the first of their names, empty ones counted
+std::string list_of_lights(const std::vector<std::string> &names);
+
 /// Names of the film channels with the layers of groups: "RGBA_key.R", ...
 std::vector<std::string> group_channels(const GroupNames &names);
 

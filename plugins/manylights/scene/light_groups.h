@@ -136,22 +136,21 @@ private:
 
     [[noreturn]] static void refuse(const Scene *scene, const GroupNames &names,
                                     size_t entry) {
-        constexpr size_t most        = 8;
         const auto &[group, pattern] = names.entries()[entry];
-        std::string known;
-        size_t count = scene->emitters().size();
-        for (size_t i = 0; i < std::min(count, most); ++i)
-            known += (i ? ", \"" : " \"") + name_of(scene->emitters()[i].get()) + "\"";
+        std::vector<std::string> known;
+        for (const auto &emitter : scene->emitters())
+            known.push_back(name_of(emitter.get()));
         throw std::runtime_error(
             "manylights: in the parameter \"light_groups\", \"" + group + "=" + pattern +
             "\" matches no light that an entry before it has not. The scene has " +
-            std::to_string(count) + (count == 1 ? " light" : " lights") +
-            (count ? ":" + known + (count > most ? ", ..." : "") : known) + ".");
+            list_of_lights(known) + ".");
     }
 
+    /// The id of its shape or else its own, which groups know it by, too; empty for none
     static std::string name_of(const Emitter *emitter) {
         const Shape *shape = emitter->shape();
-        return std::string(shape ? shape->id() : emitter->id());
+        std::string id(shape ? shape->id() : emitter->id());
+        return id.empty() ? std::string(emitter->id()) : id;
     }
 
     void find_shapes(const Scene *scene,
