@@ -1,5 +1,6 @@
 """Instances of USD stages: what shines shines in each place, the rest becomes Mitsuba instances."""
 
+import itertools
 import subprocess
 import sys
 import time
@@ -239,6 +240,55 @@ def test_purposes_and_activation(load):
     assert [x for x, _, _ in positions_of(load(lights + off))] == [0, 1]
     scene = load(lights + off, purposes=("default", "proxy"))
     assert [x for x, _, _ in positions_of(scene)] == [0, 2]
+
+
+PURPOSES = ("default", "render", "proxy", "guide")
+HIDING = '(prepend apiSchemas = ["VisibilityAPI"]) {;uniform token renderVisibility = "invisible";'
+
+
+def test_purposes_are_hidden_as_usd_computes(tmp_path):
+    from manylights import usd
+
+    opinions = (None, "inherited", "invisible", "visible")
+    parts = []
+    for outer, inner, purpose in itertools.product(opinions, opinions, PURPOSES):
+        light = f'def SphereLight "bulb" {{;{POINT}{placed(x=len(parts))}}};'
+        for opinion in (inner, outer):
+            api = '(prepend apiSchemas = ["VisibilityAPI"])' if opinion else ""
+            value = f'uniform token {purpose}Visibility = "{opinion}";' if opinion else ""
+            light = f'def Xform "inside" {api} {{;{value}{light}}};'
+        own = f'uniform token purpose = "{purpose}";'
+        parts.append(f'def Xform "x{len(parts)}" {{;{own}{light}}};')
+    path = write_stage(tmp_path, "".join(parts))
+    expected = []
+    stage = Usd.Stage.Open(str(path))
+    for prim in stage.Traverse():
+        imageable = UsdGeom.Imageable(prim)
+        if prim.IsA(UsdLux.SphereLight):
+            purpose = imageable.ComputePurpose()
+            # Guides are hidden there if nobody says otherwise; who asks for them wants them
+            drawn = imageable.ComputeEffectiveVisibility(purpose) != "invisible"
+            expected.append(drawn or (purpose == "guide" and not _has_opinion(prim)))
+    assert expected.count(False) == 3 * 5 and len(expected) == 64
+    scene = usd.load(path, purposes=PURPOSES)
+    assert [x for x, _, _ in positions_of(scene)] == np.flatnonzero(expected).tolist()
+
+
+def _has_opinion(light):
+    inner = light.GetParent()
+    return any(prim.HasAPI(UsdGeom.VisibilityAPI) for prim in (inner, inner.GetParent()))
+
+
+def test_purposes_are_hidden_in_instances(load):
+    render = 'uniform token purpose = "render";'
+    proto = f'class Xform "_lamp" {{;{render}def SphereLight "in" {{;{POINT}}};}};'
+    header = "(instanceable = true;inherits = </_lamp>)"
+    shown, hidden = (f'def Xform "n{x}" {header} {{;{placed(x=x)}}};' for x in (1, 2))
+    scene = load(f'{proto}{shown}def Xform "h" {HIDING}{hidden}}};')
+    assert [x for x, _, _ in positions_of(scene)] == [1]
+    text = instancer(PLACES, render)
+    assert len(positions_of(load(text))) == len(PLACES)
+    assert positions_of(load(text.replace('"lamps" {', f'"lamps" {HIDING}'))) == []
 
 
 @settings(max_examples=20, deadline=None, derandomize=True, database=None)

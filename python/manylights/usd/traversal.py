@@ -80,13 +80,24 @@ class Batch:
 class _State:
     """What prims inherit: transform, purpose, and the instancers that they are in.
 
-    Whether a prim's own transform is that to the world is not inherited.
+    And which purposes are hidden (``VisibilityAPI``). Whether a prim's own transform is that to the
+    world is not inherited.
     """
 
     matrix: np.ndarray
     purpose: str | None = None
     chain: tuple[Sdf.Path, ...] = ()
     resets: bool = False
+    hidden: frozenset[str] = frozenset()
+
+    def inside(self, *chain: Sdf.Path) -> _State:
+        """Return what a prototype inherits, or what begins anew, in further instancers."""
+        return _State(np.eye(4), self.purpose, (*self.chain, *chain), hidden=self.hidden)
+
+    def is_drawn(self, purposes: tuple[str, ...]) -> bool:
+        """Is it of one of these purposes, which is not hidden?"""
+        purpose = self.purpose or UsdGeom.Tokens.default_
+        return purpose in purposes and purpose not in self.hidden
 
 
 def collect(context: Context) -> list[Batch]:
@@ -172,10 +183,11 @@ class _Traversal:
             self._wait_outside(prim, state, batch)
             return None
         if prim.IsInstance() and not is_root:
-            key = (prim.GetPrototype().GetPath(), state.purpose, *self._keys.of(prim))
+            inherited = (state.purpose, state.hidden)
+            key = (prim.GetPrototype().GetPath(), *inherited, *self._keys.of(prim))
             self._native.setdefault(key, []).append((prim, state))
             return None
-        if (state.purpose or UsdGeom.Tokens.default_) in self.context.purposes:
+        if state.is_drawn(self.context.purposes):
             if role == "instancer":
                 self._expand(UsdGeom.PointInstancer(prim), state, batch)
             elif role in ("light", "geometry"):
@@ -204,7 +216,7 @@ class _Traversal:
             own = local_matrix(xformable, self.context.time)
             resets = xformable.GetResetXformStack()
             matrix = own if resets else own @ matrix
-        return _State(matrix, purpose, state.chain, resets)
+        return _State(matrix, purpose, state.chain, resets, _hidden(prim, state.hidden))
 
     def _flush_native(self, batch: Batch) -> None:
         """Make one batch of all native instances of a prototype that look the same."""
@@ -213,16 +225,14 @@ class _Traversal:
         for members in itertools.chain(*map(self._keys.apart, groups.values())):
             prim, state = members[0]
             matrices = np.stack([member.matrix for _, member in members])
-            state = _State(np.eye(4), state.purpose, state.chain)
-            self._wait(prim, state, matrices, batch, PROXIES, outer=outer)
+            self._wait(prim, state.inside(), matrices, batch, PROXIES, outer=outer)
 
     def _wait_outside(self, prim: Usd.Prim, state: _State, batch: Batch) -> None:
         """Make a batch of a prim that does not move with the native instances that it is in."""
         outside = Batch(batch.outer, color=batch.color)
         times = len(batch.transforms) // len(batch.outer)
         matrices = np.tile(state.matrix, (times, 1, 1))
-        state = _State(np.eye(4), state.purpose, state.chain)
-        self._wait(prim, state, matrices, outside, PROXIES, outer=batch.outer)
+        self._wait(prim, state.inside(), matrices, outside, PROXIES, outer=batch.outer)
 
     def _expand(self, instancer: UsdGeom.PointInstancer, state: _State, batch: Batch) -> None:
         """Make one batch of all instances of each prototype and color."""
@@ -233,7 +243,7 @@ class _Traversal:
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         indices, matrices, numbers = self._instances(instancer, len(targets))
         colors, color_of = self._colors(instancer, numbers)
-        inside = _State(np.eye(4), state.purpose, (*state.chain, prim.GetPath()))
+        inside = state.inside(prim.GetPath())
         groups = indices * len(colors) + color_of
         for group in np.unique(groups):
             index, color = divmod(int(group), len(colors))
@@ -353,6 +363,22 @@ class _Traversal:
             look["color"] = batch.color
         batch = Batch(transforms, instancers=state.chain, **look)
         self._waiting.append((root, state, batch, predicate))
+
+
+def _hidden(prim: Usd.Prim, above: frozenset[str]) -> frozenset[str]:
+    """Return which purposes are hidden at a prim: the nearest opinion above it counts.
+
+    As ``ComputeEffectiveVisibility``, but that knows neither instancers nor who asks for guides.
+    """
+    if not prim.HasAPI(UsdGeom.VisibilityAPI):
+        return above
+    api, hidden = UsdGeom.VisibilityAPI(prim), set(above)
+    for purpose in (UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide):
+        attribute = api.GetPurposeVisibilityAttr(purpose)
+        if attribute.HasAuthoredValue():
+            hidden.discard(purpose)
+            hidden |= {purpose} if attribute.Get() == UsdGeom.Tokens.invisible else set()
+    return frozenset(hidden)
 
 
 def _role_of(prim: Usd.Prim) -> str:
