@@ -89,8 +89,8 @@ public:
     }
 
 private:
-    /// Of all lamps, for each pixel and sample: a point takes less time than a camera ray
-    static constexpr double kMostPoints = .1;
+    /// Of all lamps, for each pixel and sample: a point takes a small part of a sample's time
+    static constexpr double kMostPoints = 2;
     /// The light B of a pixel, of the mean of all that lamps may show: many are hidden
     static constexpr double kOthers = .1;
     /// Above this share a lamp is large: camera rays do well alone
