@@ -156,10 +156,12 @@ private:
                 // Not rounded to zero in units of the scene
                 Float guess(
                     dr::select(h > 0.f, dr::maximum(h * tree.unit * bsdf, FLT_MIN), 0.f));
+                // H is attenuated already: no distance
+                Point3f here(vertex.at.p);
                 dr::masked(result, other) = Sample::make(
                     Spectrum(1.f),
-                    mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess)),
-                    Point3f(0.f), Point3f(0.f), Mask(false));
+                    mitsuba::depolarizer<Spectrum>(UnpolarizedSpectrum(guess)), here,
+                    here, Mask(false));
             } else if (dr::any_or<true>(other)) {
                 Sample sample = sample_emitter(vertex, m_emission.emitter_of(row), u,
                                                Float(inclusion), other);
