@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tests.path_references import light_tree
 from tests.test_media_closed_forms import camera
 from tests.test_path_closed_forms import assert_exact, both_variants, images_of
 
@@ -17,14 +18,18 @@ pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
 SIGMA, ALBEDO = 0.1, 0.8
 
-#: Distances along the view, which is the z axis.
-DISTANCES = np.linspace(0, 150, 300_001)
+
+def distances_along(z):
+    """Distances along the view, which is the z axis: closer together near one of them."""
+    near = np.geomspace(1e-7, 150, 100_001)
+    nodes = np.concatenate([np.linspace(0, 150, 300_001), z + near, z - near])
+    return np.unique(nodes[(nodes >= 0) & (nodes <= 150)])
 
 
 def scene(lamps):
     """Lamps in fog without borders, seen along the z axis."""
     medium = {"type": "homogeneous", "sigma_t": SIGMA, "albedo": ALBEDO}
-    view = camera((0, 0, 0), (0, 0, 1), fov=0.001, up=(0, 1, 0), medium=medium)
+    view = camera((0, 0, 0), (0, 0, 1), fov=0.0001, up=(0, 1, 0), medium=medium)
     return {"type": "scene", "sensor": view, **lamps}
 
 
@@ -44,11 +49,12 @@ def small_disk(place, target, radius=1e-3):
 
 def along_the_view(place, target, shape):
     """Light that a lamp sends along the view, whose intensity is ``shape`` of the cosine."""
-    w = np.stack(np.broadcast_arrays(-place[0], -place[1], DISTANCES - place[2]), axis=-1)
+    t = distances_along(place[2])
+    w = np.stack(np.broadcast_arrays(-place[0], -place[1], t - place[2]), axis=-1)
     axis = np.subtract(target, place) / np.linalg.norm(np.subtract(target, place))
     r = np.linalg.norm(w, axis=-1)
-    arrives = shape(w @ axis / r) / r**2 * np.exp(-SIGMA * (DISTANCES + r))
-    return np.trapezoid(ALBEDO * SIGMA / (4 * np.pi) * arrives, DISTANCES)
+    arrives = shape(w @ axis / r) / r**2 * np.exp(-SIGMA * (t + r))
+    return np.trapezoid(ALBEDO * SIGMA / (4 * np.pi) * arrives, t)
 
 
 def of_spot(place, target, cutoff, beam=None, intensity=1.0):
@@ -71,6 +77,10 @@ BEAMS = {
     "partly behind the camera": ((1, 0, 2), (0, 0, 0.1), 30),
     "half a sphere": ((1, 0, 5), (1, 0, 9), 90),
     "more than half": ((1, 0, 5), (1, 0, 9), 120),
+    "close to the lamp": ((1e-3, 0, 5), (1e-3, 1e-3, 5.002), 60),
+    "all but in it": ((1e-4, 0, 5), (0, 0, 5.0001), 60),
+    "far away": ((1, 0, 50), (0, 0, 50.5), 1),
+    "laser": ((1, 0, 5), (0, 0, 5.5), 0.3),
 }
 
 
@@ -127,3 +137,24 @@ def test_beams_among_other_lamps(variant, method):
     """Chosen by the light at the nearest point they would be found too seldom to tell 10 %."""
     lamps, exact = far_beams()
     assert_exact(images_of(lamps, max_depth=2, method=method), exact, label=f"{method}, {variant}")
+
+
+@both_variants
+def test_guessed_targets_do_not_depend_on_the_origin(variant):
+    """Spots with a picture, which their plugin samples: moving the scene changes no choice."""
+    texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ones((2, 2, 3), np.float32))}
+    images = []
+    for x in (0, 64):
+        rng = np.random.default_rng(2)
+        places = rng.uniform([x - 4, -4, 4], [x + 4, 4, 12], (40, 3))
+        targets = places + rng.normal(size=(40, 3))
+        lamps = {f"spot_{i}": spot(*ends, 40) for i, ends in enumerate(zip(places, targets))}
+        for lamp in lamps.values():
+            lamp["texture"] = texture
+        medium = {"type": "homogeneous", "sigma_t": SIGMA, "albedo": ALBEDO}
+        view = camera((x, 0, 0), (x, 0, 1), fov=20, up=(0, 1, 0), medium=medium)
+        scene = {"type": "scene", "sensor": view, **lamps}
+        integrator = light_tree(max_depth=2, reservoirs=8, shadow_rays=1)
+        images.append(np.array(mi.render(mi.load_dict(scene), integrator=integrator, spp=4)))
+    same = np.isclose(images[0], images[1], rtol=1e-2)
+    assert same.mean() > 0.9, f"{variant}: {1 - same.mean():.0%} of the pixels differ"

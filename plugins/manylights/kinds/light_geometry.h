@@ -24,13 +24,14 @@ template <typename Float> struct Appearance {
     DRJIT_STRUCT(Appearance, w, variance, intensity)
 };
 
-/// All directions in which a light shines: those whose cosine with the axis is no less
+/// All directions in which a light shines: those whose cosine with the axis is no less. Narrow ones
+/// are known by their sine.
 template <typename Float> struct Beam {
     using Vector3f = mitsuba::Vector<Float, 3>;
     Vector3f axis  = 0.f;
-    Float cosine   = -1.f;
+    Float cosine = -1.f, sine = 0.f;
 
-    DRJIT_STRUCT(Beam, axis, cosine)
+    DRJIT_STRUCT(Beam, axis, cosine, sine)
 };
 
 /// A point on a light as seen from a reference point
@@ -128,7 +129,8 @@ template <typename Float> mitsuba::Vector<Float, 3> flat_normal(const Row<Float>
 /// The side to which it emits
 template <typename Float>
 Beam<Float> flat_beam(const Row<Float> &row, const dr::mask_t<Float> &two_sided = false) {
-    return { flat_normal(row), dr::select(two_sided, Float(-1.f), Float(0.f)) };
+    return { flat_normal(row), dr::select(two_sided, Float(-1.f), Float(0.f)),
+             Float(1.f) };
 }
 
 /// Density of the direction w to a uniform point of a triangle or a disk, whose area is

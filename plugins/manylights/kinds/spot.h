@@ -61,7 +61,8 @@ struct SpotLight : DeltaLight {
     static bool is_narrow(const LightRow &row) { return row.geometry[6] < kWidestBeam; }
 
     template <typename Float> static Beam<Float> beam(const Row<Float> &row) {
-        return { row.vector(3), dr::cos(row[6]) };
+        auto [sine, cosine] = dr::sincos(row[6]);
+        return { row.vector(3), cosine, sine };
     }
 
     template <typename Float>

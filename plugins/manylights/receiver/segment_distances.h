@@ -31,10 +31,11 @@ public:
      */
     SegmentDistances(const Receiver &at, const Vector3f &w, const Float &variance,
                      const Beam<Float> *beam)
-        : m_at(at), m_start(0.f),
-          m_view(-dr::dot(at.wi, w), dr::squared_norm(w), variance, at.nearby()) {
+        : m_at(at), m_start(0.f), m_nearest(-dr::dot(at.wi, w)),
+          m_off(dr::fnmadd(at.wi, m_nearest, -w)),
+          m_view(m_nearest, dr::squared_norm(m_off), variance, at.nearby()) {
         if (beam)
-            restrict(w, *beam);
+            restrict(*beam);
         m_angle = m_view.angle();
     }
 
@@ -90,16 +91,23 @@ private:
     }
 
     /**
-     * Let the view be of the part of the segment that is in a beam, if there is any. The cosine of
-     * its axis with the direction to nearest + D x is (across + along x) / sqrt(1 + x^2): that of
-     * the beam's border at the roots of a quadratic. More than half a sphere is no beam.
+     * Let the view be of the part of the segment that is in a beam, if there is any. With the light's
+     * true distance D from the line the cosine of its axis with the direction to nearest + D x is
+     * (across + along x) / sqrt(1 + x^2): that of the beam's border at the roots of a quadratic.
+     * More than half a sphere is no beam.
      */
-    void restrict(const Vector3f &w, const Beam<Float> &beam) {
-        Float along  = -dr::dot(beam.axis, m_at.wi),
-              across = dr::fmsub(m_view.nearest, along, dr::dot(beam.axis, w)) /
-                       m_view.distance,
-              c2 = dr::square(beam.cosine), a = dr::fmsub(along, along, c2),
-              rest   = dr::fmadd(across, across, a),
+    void restrict(const Beam<Float> &beam) {
+        Vector3f d       = -m_at.wi;
+        Float off        = dr::norm(m_off) + 1e-30f;
+        Vector3f to_line = m_off / off, normal = dr::cross(d, to_line);
+        Float along = dr::dot(beam.axis, d), across = dr::dot(beam.axis, to_line);
+        // along^2 - cos^2, and across^2 more: of narrow beams by what is left of 1
+        Float s2 = dr::square(beam.sine), c2 = dr::square(beam.cosine);
+        auto narrow  = beam.cosine > .7f;
+        Float a      = dr::select(narrow, s2 - dr::squared_norm(dr::cross(d, beam.axis)),
+                                  dr::fmsub(along, along, c2)),
+              rest   = dr::select(narrow, s2 - dr::square(dr::dot(beam.axis, normal)),
+                                  dr::fmadd(across, across, a)),
               root   = beam.cosine * dr::sqrt(dr::maximum(rest, 0.f)),
               middle = -across * along;
         Float one = (middle - root) / a, two = (middle + root) / a;
@@ -109,11 +117,10 @@ private:
                                 low),
               to   = dr::select(open, dr::select(along > 0.f, dr::Infinity<Float>, low),
                                 high);
-        from       = dr::clip(dr::fmadd(m_view.distance, from, m_view.nearest), 0.f,
-                              m_view.length);
-        to = dr::clip(dr::fmadd(m_view.distance, to, m_view.nearest), 0.f, m_view.length);
-        auto cut = beam.cosine >= 0.f && met && to > from;
-        m_start  = dr::select(cut, from, 0.f);
+        from       = dr::clip(dr::fmadd(off, from, m_nearest), 0.f, m_view.length);
+        to         = dr::clip(dr::fmadd(off, to, m_nearest), 0.f, m_view.length);
+        auto cut   = beam.cosine >= 0.f && met && to > from;
+        m_start    = dr::select(cut, from, 0.f);
         m_view.nearest -= m_start;
         m_view.length = dr::select(cut, to - from, m_view.length);
     }
@@ -128,8 +135,10 @@ private:
     }
 
     const Receiver &m_at;
-    /// Where the angles begin
-    Float m_start;
+    /// Where the angles begin; distance of the light's nearest point of the line
+    Float m_start, m_nearest;
+    /// From the light to that point
+    Vector3f m_off;
     SegmentView<Float, Float> m_view;
     Float m_angle;
 };

@@ -13,11 +13,15 @@ template <typename Value, typename Float> struct SegmentView {
     Value nearest, distance;
     Float length;
 
-    SegmentView(const Value &along, const Value &norm2, const Value &variance,
+    /**
+     * @param off2  square of the light's distance from the line: that of a difference of vectors,
+     *              since one of squares would be lost in rounding
+     */
+    SegmentView(const Value &nearest, const Value &off2, const Value &variance,
                 const Float &length)
-        : nearest(along), length(length) {
-        Value off2 = max_of(dr::fnmadd(along, along, norm2), 0.f);
-        distance   = dr::sqrt(dr::fmadd(norm2, 1e-7f, off2 + variance) + 1e-30f);
+        : nearest(nearest), length(length) {
+        distance =
+            dr::sqrt(dr::fmadd(nearest * nearest, 1e-13f, off2 + variance) + 1e-30f);
     }
 
     /// The angle that the segment fills

@@ -136,15 +136,17 @@ Four<Float> segment_importance(const Receiver<Float> &at, const Clusters<Float> 
     };
     F4 w[3]  = { c.mean[0] - at.p.x(), c.mean[1] - at.p.y(), c.mean[2] - at.p.z() },
        d[3]  = { -at.wi.x(), -at.wi.y(), -at.wi.z() };
-    F4 start = dot(w, d);
-    SegmentView<F4, Float> view(start, dot(w, w), c.variance, at.nearby());
+    F4 start = dot(w, d), from[3];
+    for (size_t i = 0; i < 3; ++i)
+        from[i] = dr::fmsub(start, d[i], w[i]);
+    SegmentView<F4, Float> view(start, dot(from, from), c.variance, at.nearby());
     F4 t = view.closest(), off = start - t,
        e2    = dr::fmadd(off, off, dr::square(view.distance)),
        inv_d = dr::rcp(view.distance), seen;
     if (directions == Directions::All) {
         seen = view.angle();
     } else {
-        F4 along = dot(c.axis, d), across = (start * along - dot(c.axis, w)) * inv_d;
+        F4 along = dot(c.axis, d), across = dot(c.axis, from) * inv_d;
         seen = segment_emission(c, view, along, across, F4(c.variance * dr::rcp(e2)),
                                 directions);
     }
