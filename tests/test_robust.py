@@ -387,4 +387,6 @@ def kernel_sizes(plugin_name, lights):
         np.array(mi.render(scene, integrator=integrator, spp=1, seed=0))  # builds
         dr.kernel_history_clear()
         np.array(mi.render(scene, integrator=integrator, spp=1, seed=1))
-        return [kernel["operation_count"] for kernel in dr.kernel_history([dr.KernelType.JIT])]
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+        # Those of different sizes are launched in the order of their sizes.
+        return sorted(kernel["operation_count"] for kernel in kernels)
