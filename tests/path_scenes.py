@@ -452,7 +452,10 @@ def fog_environment():
 
 
 def fog_many_kinds():
-    """Fog under a mesh, textured rectangles, disks, cylinders and projectors."""
+    """Fog about a mesh, textured rectangles, disks, cylinders and projectors.
+
+    Behind a border Mitsuba loses light of lamps whose surface it nearly runs along.
+    """
     lights = {"lamps": make_mesh(triangles(60), rgb([2, 1.5, 1]))}
     lights |= shapes("rectangle", 4, seed=7, size=0.4, radiance=stripes(6.0))
     lights |= shapes("disk", 4, seed=8, total=6.0) | shapes("cylinder", 4, seed=9, total=6.0)
@@ -463,7 +466,7 @@ def fog_many_kinds():
             "fov": 40 + 10 * index,
             "to_world": transform().look_at([x, -1, 2.2], [0.5 * x, 0, 0], [0, 1, 0]),
         }
-    return fog(lights=lights)
+    return fog(top=3.0, lights=lights)
 
 
 def fog_visible_lamps():

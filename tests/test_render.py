@@ -218,7 +218,9 @@ def test_variance_is_that_of_the_image(fewer_pilots, llvm):
         assert tools.welch(factor * found, expected).p < tools.SIGNIFICANCE
 
 
-@pytest.mark.parametrize(("name", "asked"), [("many_bulbs", 0.03), ("interior", 0.1), ("fog", 0.07)])
+@pytest.mark.parametrize(
+    ("name", "asked"), [("many_bulbs", 0.03), ("interior", 0.1), ("fog", 0.07)]
+)
 def test_noise_asked_for_is_reached(few_pilots, name, asked):
     scene = loaded(name)
     for seed in range(2):
