@@ -134,9 +134,6 @@ random.
 lights there are. **It works less well**
 
 - where most lights are hidden and there is too little to learn from, see below;
-- among hundreds of thousands of small lamps, where other parts of a pixel have other lamps: more
-  samples with fewer lights pay then, half the error with :code:`splitting_rate` 0.25 and a million
-  (not in rooms that are lit by their own lamps);
 - for very few lights, or lights of equal importance, where Mitsuba's :monosp:`direct` does
   the same with less arithmetic.
 
@@ -168,7 +165,7 @@ media between. Films with bands of their own (:monosp:`specfilm`) take no furthe
 camera rays. Emissive triangles, spheres, disks and cylinders that cover less than a quarter of the
 pixels that their image touches are therefore sampled from their side, too, and what a perspective
 or thin lens camera sees of their points is put on the film, weighted against camera rays by the
-balance heuristic. There is at most one point for ten camera rays, most of them on lamps that are
+balance heuristic. There are at most two points for each camera ray, most of them on lamps that are
 bright for what they cover; lamps that are large, out of sight or seen in mirrors are left to rays.
 This is part of rendering: integrators that nest this one, and gradients, have camera rays alone.
 
