@@ -31,14 +31,14 @@ def integrator(name, **parameters):
     return mi.load_dict({"type": kind, **parameters})
 
 
-def single_samples(name, seeds=TAIL_SEEDS, **parameters):
+def single_samples(name, seeds=TAIL_SEEDS, size=TAIL_SIZE, **parameters):
     """Brightness of single samples of a case, (seeds, pixels)."""
-    return brightness(CASES[name].scene(), integrator(name, **parameters), seeds)
+    return brightness(CASES[name].scene(), integrator(name, **parameters), seeds, size)
 
 
-def brightness(description, integrator, seeds=TAIL_SEEDS):
+def brightness(description, integrator, seeds=TAIL_SEEDS, size=TAIL_SIZE):
     """The same for any scene's dictionary."""
-    scene = load(description, TAIL_SIZE)
+    scene = load(description, size)
     images = tools.render_seeds(scene, integrator, spp=1, seeds=range(seeds))
     return images.mean(axis=-1).reshape(seeds, -1)
 
