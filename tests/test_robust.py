@@ -50,7 +50,8 @@ def run_python(script, *arguments):
     process = start_python(script, *arguments)
     output, errors = process.communicate()
     assert process.returncode == 0, errors
-    return json.loads(output.splitlines()[-1])
+    # Mitsuba ends the colour of a warning at the beginning of the next line.
+    return json.loads(output.splitlines()[-1].removeprefix("\x1b[0m"))
 
 
 # ---------------------------------------------------------------------------------- being stopped
