@@ -29,8 +29,8 @@ MANY_LIGHTS = (
     "huge-and-tiny-rough",
     "huge-and-tiny-specular",
 )
-"""Cases with thousands of lights: all of them as candidates leave so little noise that a small image
-tells the percentile to 1 %."""
+"""Cases with thousands of lights: all of them as candidates leave so little noise that a small
+image tells the percentile to 1 %."""
 
 
 def assert_no_fireflies(values, reference, tail):
