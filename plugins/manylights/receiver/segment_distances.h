@@ -31,11 +31,12 @@ public:
      */
     SegmentDistances(const Receiver &at, const Vector3f &w, const Float &variance,
                      const Beam<Float> *beam)
-        : m_at(at), m_start(0.f), m_nearest(-dr::dot(at.wi, w)),
-          m_off(dr::fnmadd(at.wi, m_nearest, -w)),
-          m_view(m_nearest, dr::squared_norm(m_off), variance, at.nearby()) {
+        : m_at(at), m_start(0.f) {
+        Float nearest = -dr::dot(at.wi, w);
+        Vector3f off  = dr::fnmadd(at.wi, nearest, -w);
+        m_view        = { nearest, dr::squared_norm(off), variance, at.nearby() };
         if (beam)
-            restrict(*beam);
+            restrict(off, *beam);
         m_angle = m_view.angle();
     }
 
@@ -95,11 +96,12 @@ private:
      * true distance D from the line the cosine of its axis with the direction to nearest + D x is
      * (across + along x) / sqrt(1 + x^2): that of the beam's border at the roots of a quadratic.
      * More than half a sphere is no beam.
+     * @param off  from the light to the line's nearest point
      */
-    void restrict(const Beam<Float> &beam) {
+    void restrict(const Vector3f &off, const Beam<Float> &beam) {
         Vector3f d       = -m_at.wi;
-        Float off        = dr::norm(m_off) + 1e-30f;
-        Vector3f to_line = m_off / off, normal = dr::cross(d, to_line);
+        Float distance   = dr::norm(off) + 1e-30f;
+        Vector3f to_line = off / distance, normal = dr::cross(d, to_line);
         Float along = dr::dot(beam.axis, d), across = dr::dot(beam.axis, to_line);
         // along^2 - cos^2, and across^2 more: of narrow beams by what is left of 1
         Float s2 = dr::square(beam.sine), c2 = dr::square(beam.cosine);
@@ -117,10 +119,10 @@ private:
                                 low),
               to   = dr::select(open, dr::select(along > 0.f, dr::Infinity<Float>, low),
                                 high);
-        from       = dr::clip(dr::fmadd(off, from, m_nearest), 0.f, m_view.length);
-        to         = dr::clip(dr::fmadd(off, to, m_nearest), 0.f, m_view.length);
-        auto cut   = beam.cosine >= 0.f && met && to > from;
-        m_start    = dr::select(cut, from, 0.f);
+        from = dr::clip(dr::fmadd(distance, from, m_view.nearest), 0.f, m_view.length);
+        to   = dr::clip(dr::fmadd(distance, to, m_view.nearest), 0.f, m_view.length);
+        auto cut = beam.cosine >= 0.f && met && to > from;
+        m_start  = dr::select(cut, from, 0.f);
         m_view.nearest -= m_start;
         m_view.length = dr::select(cut, to - from, m_view.length);
     }
@@ -135,10 +137,8 @@ private:
     }
 
     const Receiver &m_at;
-    /// Where the angles begin; distance of the light's nearest point of the line
-    Float m_start, m_nearest;
-    /// From the light to that point
-    Vector3f m_off;
+    /// Where the angles begin
+    Float m_start;
     SegmentView<Float, Float> m_view;
     Float m_angle;
 };

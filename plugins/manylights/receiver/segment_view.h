@@ -13,6 +13,7 @@ template <typename Value, typename Float> struct SegmentView {
     Value nearest, distance;
     Float length;
 
+    SegmentView() = default;
     /**
      * @param off2  square of the light's distance from the line: that of a difference of vectors,
      *              since one of squares would be lost in rounding
