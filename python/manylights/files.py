@@ -23,6 +23,12 @@ def path_of(name: str, value: str | Path) -> Path:
     return Path(value)
 
 
+def require(path: str | Path, prefix: str = "") -> None:
+    """Raise ``UsageError`` unless there is such a file; the prefix is for the message."""
+    if not Path(path).is_file():
+        raise UsageError(f"{prefix}{path}: no such file")
+
+
 def check_output(path: str, kind: str = "", ending: str = "", named: bool = True) -> Path:
     """Return ``path``, the argument ``output``, if a file can be written there.
 

@@ -15,6 +15,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from manylights import files
 from manylights.bench import methods, metrics, samplers
 from manylights.bench.drawing import draw
 from manylights.bench.moments import Moments
@@ -90,6 +91,5 @@ def fingerprint(path: str | None) -> str:
     """Return a text that differs for references that differ, empty without one."""
     if path is None:
         return ""
-    if not Path(path).is_file():
-        raise UsageError(f"--reference {path}: no such file")
+    files.require(path, "--reference ")
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()

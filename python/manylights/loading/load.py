@@ -83,14 +83,7 @@ def load(
     return loaded
 
 
-def check_arguments(
-    path: str,
-    defines: dict[str, str] | None = None,
-    integrator: str | None = None,
-    settings: dict | None = None,
-    usd_options: UsdOptions | None = None,
-    sampler: str | None = None,
-) -> None:
+def check_arguments(path, defines, integrator, settings, usd_options, sampler) -> None:
     """Raise ``UsageError`` for arguments that ``load`` refuses whatever the scene is."""
     for name, value in (("integrator", integrator), ("sampler", sampler)):
         check(name, value, value is None or isinstance(value, str), "the name of a plugin")

@@ -106,9 +106,7 @@ def parse(
     return ParsedScene(config, state, files_of(state))
 
 
-def check_file(
-    path: str, defines: dict[str, str] | None = None, usd_options: UsdOptions | None = None
-) -> None:
+def check_file(path: str, defines: dict[str, str] | None, usd_options: UsdOptions | None) -> None:
     """Check what the name of a scene's file tells, without reading it: arguments of ``parse``.
 
     Raises:

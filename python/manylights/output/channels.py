@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from manylights import files
 from manylights.errors import UsageError, argument, check, one_line
 from manylights.output import exr
 from manylights.threads import threads_for_files
@@ -162,8 +163,7 @@ def read(path: str | Path, prefix: str = "") -> dict[str, np.ndarray]:
     Raises:
         UsageError: no such file, or not a whole image.
     """
-    if not Path(path).is_file():
-        raise UsageError(f"{prefix}{path}: no such file")
+    files.require(path, prefix)
     try:
         if Path(path).suffix.lower() == ".exr":
             planes = exr.read(path)[0]

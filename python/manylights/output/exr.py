@@ -130,8 +130,7 @@ def fact(value: Any) -> Any:
 def _opened(path: str | Path, **how):
     import OpenEXR
 
-    if not Path(path).is_file():
-        raise UsageError(f"{path}: no such file")
+    files.require(path)
     try:
         with open(path, "rb") as file:
             if file.read(len(MAGIC)) != MAGIC:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from manylights import files
@@ -39,10 +38,4 @@ def check_together(
         raise UsageError(f"{name}: must be given with {argument('client')}")
     if learnt is not None:
         check("learnt", learnt, part is not None, f"given with {argument('part')}")
-        _check_file("learnt", learnt)
-
-
-def _check_file(name: str, value: str | Path) -> None:
-    path = files.path_of(name, value)
-    if not path.is_file():
-        raise UsageError(f"{argument(name)} {path}: no such file")
+        files.require(files.path_of("learnt", learnt), f"{argument('learnt')} ")

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from manylights import files
 from manylights.errors import UsageError, one_line
 from manylights.output import channels, exr
 from manylights.rendering import metadata
@@ -95,8 +96,7 @@ def read(path: Path, prefix: str, remedy: str) -> tuple[Saved, dict[str, np.ndar
     Raises:
         UsageError: not such a file, or not a whole one.
     """
-    if not path.is_file():
-        raise UsageError(f"{path}: no such file")
+    files.require(path)
     try:
         planes, attributes = exr.read(path)
         facts = {

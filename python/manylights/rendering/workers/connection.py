@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 import drjit as dr
 
+from manylights import files
 from manylights.errors import UsageError, one_line
 from manylights.progress import say
 
@@ -149,8 +150,7 @@ def scheduler_address(address: str) -> str:
     """
     if not address.endswith(".json"):
         return address
-    if not Path(address).is_file():
-        raise UsageError(f"--workers {address}: no such file")
+    files.require(address, "--workers ")
     try:
         return str(json.loads(Path(address).read_text())["address"])
     except (ValueError, KeyError, TypeError) as error:
