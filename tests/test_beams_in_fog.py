@@ -26,10 +26,10 @@ def distances_along(z):
     return np.unique(nodes[(nodes >= 0) & (nodes <= 150)])
 
 
-def scene(lamps):
-    """Lamps in fog without borders, seen along the z axis."""
+def scene(lamps, x=0, fov=0.0001):
+    """Lamps in fog without borders, seen along the z axis or a line beside it."""
     medium = {"type": "homogeneous", "sigma_t": SIGMA, "albedo": ALBEDO}
-    view = camera((0, 0, 0), (0, 0, 1), fov=0.0001, up=(0, 1, 0), medium=medium)
+    view = camera((x, 0, 0), (x, 0, 1), fov=fov, up=(0, 1, 0), medium=medium)
     return {"type": "scene", "sensor": view, **lamps}
 
 
@@ -157,10 +157,8 @@ def test_guessed_targets_do_not_depend_on_the_origin(variant):
         lamps = {f"spot_{i}": spot(*ends, 40) for i, ends in enumerate(zip(places, targets))}
         for lamp in lamps.values():
             lamp["texture"] = texture
-        medium = {"type": "homogeneous", "sigma_t": SIGMA, "albedo": ALBEDO}
-        view = camera((x, 0, 0), (x, 0, 1), fov=20, up=(0, 1, 0), medium=medium)
-        scene = {"type": "scene", "sensor": view, **lamps}
+        moved = mi.load_dict(scene(lamps, x, fov=20))
         integrator = light_tree(max_depth=2, reservoirs=8, shadow_rays=1)
-        images.append(np.array(mi.render(mi.load_dict(scene), integrator=integrator, spp=4)))
+        images.append(np.array(mi.render(moved, integrator=integrator, spp=4)))
     same = np.isclose(images[0], images[1], rtol=1e-2)
     assert same.mean() > 0.9, f"{variant}: {1 - same.mean():.0%} of the pixels differ"

@@ -54,10 +54,9 @@ def assert_little_variance(values, limit):
 def test_distribution_of_samples(llvm, name):
     """Bright samples are as rare as in exhaustive resampling; the variance is what it was."""
     values = samples.single_samples(name)
-    many = {"seeds": 1, "size": samples.TAIL_SIZE // 2} if name in MANY_LIGHTS else {}
-    reference = samples.single_samples(
-        name, **{"seeds": REFERENCE_SEEDS, **many}, method="exhaustive"
-    )
+    many = name in MANY_LIGHTS
+    seeds, size = (1, samples.TAIL_SIZE // 2) if many else (REFERENCE_SEEDS, samples.TAIL_SIZE)
+    reference = samples.single_samples(name, seeds, size, method="exhaustive")
     assert_no_fireflies(values, reference, CASES[name].tail)
     assert_little_variance(values, CASES[name].variance)
 
