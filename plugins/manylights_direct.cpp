@@ -297,7 +297,7 @@ public:
                                           sampler->next_1d(active),
                                           sampler->next_2d(active) };
         BSDFPtr bsdf = si.bsdf(ray);
-        auto vertex  = direct.prepare(si, bsdf, nullptr, u, active);
+        auto vertex  = direct.prepare(si, bsdf, nullptr, u, UInt32(0), active);
         Mask lit     = vertex.is_lit_surface(active);
         if (dr::any_or<true>(lit))
             result += direct.sample_lights(vertex, counts, light, lit);

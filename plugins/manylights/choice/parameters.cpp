@@ -125,7 +125,7 @@ SamplingParameters read_path_parameters(const Properties &props) {
     SamplingParameters p = read(props, kVolpath);
     int64_t max_depth    = props.get<int64_t>("max_depth", -1);
     if (max_depth < 0 || max_depth > 2)
-        p.candidates_per_rate = kCandidatesPerRateOnPaths;
+        p.effort = kSeveralBounces;
     return p;
 }
 

@@ -19,9 +19,13 @@ namespace manylights {
 
 /// K above which systematic sampling would lose the fraction of a float: visit all lights
 constexpr float kMaxExpectedCandidates = 1 << 14;
-/// K for a splitting rate of 1, and for paths of several bounces. Light that has been reflected is
-/// dimmer, and rays that lead to the vertices of a path cost as much as shadow rays: fewer pay.
-constexpr float kCandidatesPerRate = 16.f, kCandidatesPerRateOnPaths = 4.f;
+/// K for a splitting rate of 1: at the first vertex, how much less at each that follows, and at
+/// least. Rays that lead to the vertices of a path cost as much as shadow rays, and light that has
+/// been reflected is dimmer: fewer pay on paths, and fewer from vertex to vertex.
+struct Effort {
+    float first, less, least;
+};
+constexpr Effort kOneBounce{ 16.f, 0.f, 16.f }, kSeveralBounces{ 6.f, 2.f, 2.f };
 
 /// What decides whether a node is split: the talk's two functions, or the variance
 enum class SplitFunction { Near, Far, Variance };
@@ -35,7 +39,7 @@ struct SamplingParameters {
     Method method;
     SplitFunction split_function;
     float splitting_rate;
-    float candidates_per_rate = kCandidatesPerRate;
+    Effort effort = kOneBounce;
     uint32_t reservoirs, shadow_rays, bsdf_samples;
     /// Are the candidates and the visited nodes counted, in film channels?
     bool counts;
@@ -43,9 +47,9 @@ struct SamplingParameters {
     /// Groups of lights that have film layers of their own
     GroupNames light_groups;
 
-    /// Expected number of candidates K, at least one
+    /// Expected number of candidates K at the first vertex, at least one
     float expected_candidates() const {
-        return std::max(1.f, candidates_per_rate * splitting_rate);
+        return std::max(1.f, effort.first * splitting_rate);
     }
     /// Upper limit of the number of candidates
     float most_candidates() const {

@@ -60,11 +60,12 @@ public:
     /// Can BSDF sampling find light at all?
     bool needs_bsdf_samples() const { return m_mis; }
 
-    /// A vertex with its random numbers; `inside` is null in scenes without media
+    /// A vertex after `depth` others, with its random numbers; `inside` is null in scenes without
+    /// media
     Vertex prepare(const SurfaceInteraction3f &si, const BSDFPtr &bsdf,
                    const typename Vertex::InMedium *inside, const LightSample<Float> &u,
-                   Mask active) const {
-        Vertex vertex{ si, bsdf, inside, u, traits(Extent::Point), active };
+                   const UInt32 &depth, Mask active) const {
+        Vertex vertex{ si, bsdf, inside, u, depth, traits(Extent::Point), active };
         look_at_tree(vertex, active);
         return vertex;
     }
@@ -72,8 +73,11 @@ public:
     /// All of a segment in a homogeneous medium
     Vertex prepare_segment(const SurfaceInteraction3f &behind, const BSDFPtr &no_bsdf,
                            const typename Vertex::InMedium &inside,
-                           const LightSample<Float> &u, Mask active) const {
-        Vertex vertex{ behind, no_bsdf, &inside, u, traits(Extent::Segment), active };
+                           const LightSample<Float> &u, const UInt32 &depth,
+                           Mask active) const {
+        Vertex vertex{
+            behind, no_bsdf, &inside, u, depth, traits(Extent::Segment), active
+        };
         look_at_tree(vertex, active);
         return vertex;
     }
@@ -133,10 +137,10 @@ public:
 
     /// Density with which \ref sample_lights chooses the direction that hit `light` or the
     /// environment, see \ref HitDensity
-    Float hit_density(const Receiver<FloatD> &at, const Float &u_tree,
-                      const SurfaceInteraction3f &hit, const UInt32D &light,
-                      Mask active) const {
-        return m_density.density(at, u_tree, hit, light, active);
+    Float hit_density(const Receiver<FloatD> &at, const UInt32D &depth,
+                      const Float &u_tree, const SurfaceInteraction3f &hit,
+                      const UInt32D &light, Mask active) const {
+        return m_density.density(at, depth, u_tree, hit, light, active);
     }
 
 private:
@@ -184,10 +188,10 @@ private:
             return;
         Spectrum radiance = m_emission.emitted(hit, light, reflected);
 
-        Mask delta      = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
-        Float light_pdf = dr::select(
-            delta, 0.f,
-            hit_density(vertex.at, vertex.u.tree, hit, light, reflected && !delta));
+        Mask delta       = has_flag(bs.sampled_type, mitsuba::BSDFFlags::Delta);
+        Float light_pdf  = dr::select(delta, 0.f,
+                                      hit_density(vertex.at, vertex.depth, vertex.u.tree,
+                                                  hit, light, reflected && !delta));
         Float pdf        = bs.pdf * (float) m_strategy.params.bsdf_samples;
         Spectrum arrives = value * radiance * mis_weight<Float>(pdf, light_pdf) /
                            (float) m_strategy.params.bsdf_samples;

@@ -27,10 +27,11 @@ public:
         : m_scene(scene), m_lights(lights), m_emission(emission), m_strategy(strategy) {}
 
     /// Density with which lights are sampled in the direction that hit `light` or the
-    /// environment, seen from the receiver of a vertex and for its random number of the tree
-    MI_NOINLINE Float density(const Receiver<FloatD> &at, const Float &u_tree,
-                              const SurfaceInteraction3f &hit, const UInt32D &light,
-                              Mask active) const {
+    /// environment, seen from the receiver of a vertex after `depth` others and for its random
+    /// number of the tree
+    MI_NOINLINE Float density(const Receiver<FloatD> &at, const UInt32D &depth,
+                              const Float &u_tree, const SurfaceInteraction3f &hit,
+                              const UInt32D &light, Mask active) const {
         auto p = at.p;
         if (at.extent == Extent::Either)
             p -= at.distance * at.wi;
@@ -57,10 +58,11 @@ public:
                 result *= Float(
                     dr::select(at.length > 0.f,
                                distances_to(at, row, tree.kinds).pdf(at.distance), 1.f));
-            result *= Float(m_strategy.with_source<FloatD>([&](const auto &source) {
-                return source.inclusion_probability(tree, at, light, plain(u_tree),
-                                                    plain(found));
-            }));
+            result *=
+                Float(m_strategy.with_source<FloatD>(depth, [&](const auto &source) {
+                    return source.inclusion_probability(tree, at, light, plain(u_tree),
+                                                        plain(found));
+                }));
             result = dr::select(found, result, 0.f);
         }
         Mask missed = active && !hit.is_valid();

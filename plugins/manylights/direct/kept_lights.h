@@ -59,7 +59,7 @@ public:
                           Mask active) const {
         dr::suspend_grad<Float> detached;
         LightSample<FloatD> u = plain_sample(vertex.u);
-        return m_strategy.with_source<FloatD>([&](const auto &source) {
+        return m_strategy.with_source<FloatD>(vertex.depth, [&](const auto &source) {
             auto cursor = source.cursor(m_lights.tree(), vertex, u.tree);
             return m_strategy.fate == Fate::KeepAll
                        ? keep_candidates(vertex, cursor, u, counts, active)

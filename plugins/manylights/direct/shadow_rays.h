@@ -98,7 +98,7 @@ public:
                       ? media_rng(vertex)
                       : make_rng(plain_sample(vertex.u));
         if (m_strategy.slots > 0)
-            m_strategy.with_source<FloatD>([&](const auto &source) {
+            m_strategy.with_source<FloatD>(vertex.depth, [&](const auto &source) {
                 result = trace_candidates(
                     vertex, source.cursor(m_lights.tree(), vertex, plain(vertex.u.tree)),
                     rng, counts, light, active);

@@ -56,18 +56,26 @@ template <typename FloatD> struct AllLightsSource {
 template <typename FloatD> struct SystematicSource {
     using UInt32D = dr::uint32_array_t<FloatD>;
     using MaskD   = dr::mask_t<FloatD>;
-    const SamplingParameters &params;
+    FloatD expected;
+
+    /// Fewer from vertex to vertex of a path, see \ref Effort
+    SystematicSource(const SamplingParameters &params, const UInt32D &depth)
+        : expected(params.effort.first) {
+        if (params.effort.less > 0.f)
+            expected = dr::maximum(expected - params.effort.less * FloatD(depth),
+                                   params.effort.least);
+        expected = dr::maximum(expected * dr::opaque<FloatD>(params.splitting_rate), 1.f);
+    }
 
     template <typename Vertex>
     auto cursor(const TreeView<FloatD> &, const Vertex &vertex, const FloatD &u) const {
-        return SystematicCursor<FloatD>(
-            vertex.top, dr::opaque<FloatD>(params.expected_candidates()), u);
+        return SystematicCursor<FloatD>(vertex.top, expected, u);
     }
     FloatD inclusion_probability(const TreeView<FloatD> &tree, const Receiver<FloatD> &at,
                                  const UInt32D &light, const FloatD &,
                                  const MaskD &active) const {
-        return SystematicCursor<FloatD>::inclusion_probability(
-            tree, at, light, dr::opaque<FloatD>(params.expected_candidates()), active);
+        return SystematicCursor<FloatD>::inclusion_probability(tree, at, light, expected,
+                                                               active);
     }
 };
 
@@ -138,11 +146,12 @@ struct Strategy {
         infinite_probability = few ? 1.f : 1.f / infinite_lights;
     }
 
-    /// Call f with the source of candidates
-    template <typename FloatD, typename F> auto with_source(const F &f) const {
+    /// Call f with the source of candidates for a vertex after `depth` others
+    template <typename FloatD, typename F>
+    auto with_source(const dr::uint32_array_t<FloatD> &depth, const F &f) const {
         switch (source) {
             case Source::Systematic:
-                return f(SystematicSource<FloatD>{ params });
+                return f(SystematicSource<FloatD>(params, depth));
             case Source::Splitting:
                 return f(SplittingSource<FloatD>{ params });
             case Source::AllLights:

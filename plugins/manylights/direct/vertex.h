@@ -78,6 +78,8 @@ template <typename Float, typename Spectrum> struct Vertex {
     /// Null if the scene has no media
     const InMedium *inside;
     LightSample<Float> u;
+    /// How many vertices of its path are before it
+    dr::uint32_array_t<FloatD> depth;
     /// As the tree sees it
     Receiver<FloatD> at;
     /// Where descents of the tree begin, if it has one
@@ -87,8 +89,10 @@ template <typename Float, typename Spectrum> struct Vertex {
     Float flight_ratio = Float(1.f);
 
     Vertex(const SurfaceInteraction3f &si, const BSDFPtr &bsdf, const InMedium *inside,
-           const LightSample<Float> &u, const ReceiverTraits &traits, Mask active)
-        : si(si), bsdf(bsdf), inside(inside), u(u), at(dr::zeros<Receiver<FloatD>>()) {
+           const LightSample<Float> &u, const UInt32 &depth, const ReceiverTraits &traits,
+           Mask active)
+        : si(si), bsdf(bsdf), inside(inside), u(u), depth(plain(depth)),
+          at(dr::zeros<Receiver<FloatD>>()) {
         at.traits()  = traits;
         Mask surface = on_surface(active);
         if (at.extent == Extent::Point && dr::any_or<true>(surface))

@@ -109,7 +109,7 @@ private:
 
         Vertex vertex =
             m_direct.prepare(si, bsdf, m_media ? &piece.inside : nullptr, draw_sample(s),
-                             m_media ? surface || piece.inside.here : surface);
+                             s.depth, m_media ? surface || piece.inside.here : surface);
         add_direct_light(s, vertex, piece, surface && !piece.hidden);
         play_roulette(s, scatter(s, vertex, piece));
         intersect(s, /* coherent = */ false);
@@ -136,8 +136,8 @@ private:
         if (dr::none_or<false>(emission.may_emit(light, si.is_valid())))
             return;
         Spectrum radiance = emission.emitted(si, light, active);
-        Float light_pdf =
-            m_direct.hit_density(s.from, s.u_tree, si, light, active && !s.specular);
+        Float light_pdf = m_direct.hit_density(s.from, plain(s.depth) - 1u, s.u_tree, si,
+                                               light, active && !s.specular);
         Float weight = dr::select(s.specular, 1.f, mis_weight<Float>(s.pdf, light_pdf));
         Spectrum arrives = radiance * dr::detach(weight);
         if (m_lamps) {
@@ -163,11 +163,11 @@ private:
         along.here            = active;
         along.length          = dr::select(active, s.pi.t, 0.f);
         const BSDFPtr no_bsdf = nullptr;
-        Vertex vertex         = m_direct.prepare_segment(behind, no_bsdf, along,
-                                                         draw_sample(s, true), active);
-        piece.along           = vertex.at;
-        piece.u_tree          = vertex.u.tree;
-        piece.along.distance  = plain(piece.inside.mei.t);
+        Vertex vertex = m_direct.prepare_segment(behind, no_bsdf, along,
+                                                 draw_sample(s, true), s.depth, active);
+        piece.along   = vertex.at;
+        piece.u_tree  = vertex.u.tree;
+        piece.along.distance = plain(piece.inside.mei.t);
         GroupLight light(s.groups);
         if (light.is_wanted())
             light.set_factor(s.throughput);
