@@ -67,7 +67,7 @@ std::vector<Parameter> make_table() {
         with(text("split_function", { "near", "far" }),
              "how the probability of splitting decays with distance", { M::Talk }),
         with(number("splitting_rate", 1, { "inf" }),
-             "candidates at a shading point, in units of 16 or, on paths, of 6, 4, 2, 2 ...",
+             "candidates at a point, in units of 16 or, on paths, of 6, 4 and 2",
              { M::ResampledTree, M::Talk, M::AdaptiveSplitting }),
         with(integer("reservoirs", kBoth, 16, 1, kMaxReservoirs),
              "lights that are kept for a full evaluation",
