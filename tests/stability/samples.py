@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 
@@ -11,8 +15,11 @@ from tests.references import ERROR, make_reference, planned_images, set_power_we
 from tests.shared_results import shared
 from tests.stability.cases import CASES
 
-TAIL_SIZE, TAIL_SEEDS = 256, 16
+TAIL_SIZE, TAIL_SEEDS, REFERENCE_SEEDS = 256, 16, 2
 """A million single samples: pixels of images with one sample per pixel."""
+RARE = 1e-4
+"""Share of the samples in a tail."""
+PERCENTILES = Path(__file__).with_name("percentiles.json")
 MEAN_SIZE = 16
 BLOCK = 4
 """Means are compared over squares of that many pixels."""
@@ -34,6 +41,31 @@ def integrator(name, **parameters):
 def single_samples(name, seeds=TAIL_SEEDS, size=TAIL_SIZE, **parameters):
     """Brightness of single samples of a case, (seeds, pixels)."""
     return brightness(CASES[name].scene(), integrator(name, **parameters), seeds, size)
+
+
+def reference_samples(name):
+    """The same with all lights as candidates, resampled like the default's."""
+    return single_samples(name, REFERENCE_SEEDS, method="exhaustive")
+
+
+@dataclass(frozen=True)
+class Tail:
+    """The 99.99th percentile of samples, and how many of them are above it."""
+
+    percentile: float
+    above: int
+    of: int
+
+
+def tail_of(values):
+    """The tail of samples."""
+    percentile = float(np.quantile(values, 1 - RARE))
+    return Tail(percentile, int((values > percentile).sum()), values.size)
+
+
+def reference_tail(name):
+    """That of `reference_samples`, from percentiles.json."""
+    return Tail(**json.loads(PERCENTILES.read_text())[name])
 
 
 def brightness(description, integrator, seeds=TAIL_SEEDS, size=TAIL_SIZE):

@@ -1,16 +1,15 @@
 """The tail of the distribution of samples: how bright rare samples get.
 
-For each case the 99.99th percentile q of a sample is estimated with all lights as candidates,
-resampled like the default's. A firefly is a sample of the default that is brighter than `tail` q,
-with `tail` = 10 unless the case says why not. It must not be more frequent than samples above q
-are in that reference: 1 in 10,000, tested with the binomial distribution. The maximum is listed in
-README.md: it grows with the number of samples, and no test is made of it.
+For each case percentiles.json has the 99.99th percentile q of a sample with all lights as
+candidates, resampled like the default's. A firefly is a sample of the default that is brighter than
+`tail` q, with `tail` = 10 unless the case says why not. It must not be more frequent than samples
+above q are in that reference: 1 in 10,000, tested with the binomial distribution. The maximum is
+listed in README.md: it grows with the number of samples, and no test is made of it.
 
 The variance of a sample has a limit, too, for each case: it tells when a cure stops working that
 leaves mean and tail alone.
 """
 
-import numpy as np
 import pytest
 from scipy import stats
 
@@ -21,24 +20,23 @@ from tests.statistics_tools import SIGNIFICANCE
 
 pytestmark = pytest.mark.usefixtures("plugin", "own_threads")
 
-RARE = 1e-4
-REFERENCE_SEEDS = 2
-MANY_LIGHTS = (
-    "coincident-10000",
-    "bright-far",
-    "huge-and-tiny-rough",
-    "huge-and-tiny-specular",
-)
-"""Cases with thousands of lights: all of them as candidates leave so little noise that a small
-image tells the percentile to 1 %."""
 
-
-def assert_no_fireflies(values, reference, tail):
+def assert_no_fireflies(values, name):
     """Samples beyond `tail` times the reference's 99.99th percentile are at most as rare."""
-    limit = tail * np.quantile(reference, 1 - RARE)
+    limit = CASES[name].tail * samples.reference_tail(name).percentile
     count = int((values > limit).sum())
-    allowed = int(stats.binom.isf(SIGNIFICANCE, values.size, RARE))
+    allowed = int(stats.binom.isf(SIGNIFICANCE, values.size, samples.RARE))
     assert count <= allowed, f"{count} of {values.size} samples above {limit:g}, {allowed} allowed"
+
+
+def assert_tail_of_reference(values, name):
+    """No more and no fewer samples are above the percentile than when it was measured."""
+    tail = samples.reference_tail(name)
+    above, before = int((values > tail.percentile).sum()), tail.above
+    if above + before > 0:
+        share = values.size / (values.size + tail.of)
+        p = stats.binomtest(above, above + before, share).pvalue
+        assert p >= SIGNIFICANCE, f"{above} of {values.size} samples, {before} of {tail.of} before"
 
 
 def assert_little_variance(values, limit):
@@ -54,18 +52,27 @@ def assert_little_variance(values, limit):
 def test_distribution_of_samples(llvm, name):
     """Bright samples are as rare as in exhaustive resampling; the variance is what it was."""
     values = samples.single_samples(name)
-    many = name in MANY_LIGHTS
-    seeds, size = (1, samples.TAIL_SIZE // 2) if many else (REFERENCE_SEEDS, samples.TAIL_SIZE)
-    reference = samples.single_samples(name, seeds, size, method="exhaustive")
-    assert_no_fireflies(values, reference, CASES[name].tail)
+    assert_no_fireflies(values, name)
     assert_little_variance(values, CASES[name].variance)
 
 
 def test_fireflies_are_found(llvm):
     """One descent of the tree where the default has sixteen does not pass."""
-    reference = samples.single_samples("spots-5", REFERENCE_SEEDS, method="exhaustive")
     values = samples.single_samples("spots-5", method="tree")
     with pytest.raises(AssertionError, match="allowed"):
-        assert_no_fireflies(values, reference, CASES["spots-5"].tail)
+        assert_no_fireflies(values, "spots-5")
     with pytest.raises(AssertionError, match="variance"):
         assert_little_variance(values, CASES["spots-5"].variance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_percentile_is_that_of_exhaustive_resampling(llvm, name):
+    """The file still says what make_readme would find."""
+    assert_tail_of_reference(samples.reference_samples(name), name)
+
+
+def test_another_percentile_is_found(llvm):
+    """One descent of the tree has another tail than exhaustive resampling."""
+    with pytest.raises(AssertionError, match="before"):
+        assert_tail_of_reference(samples.single_samples("spots-5", 2, method="tree"), "spots-5")
