@@ -18,6 +18,7 @@ import pytest
 from hypothesis import strategies as st
 
 from tests import described_scenes, light_quadrature, scene_strategies
+from tests.command_line import manylights_process
 from tests.example_tools import (
     SEEDS,
     compare_in_scenes,
@@ -102,6 +103,40 @@ def test_hidden_emitter_is_passed_along_its_surface(scalar):
     scene |= {"integrator": {"type": "manylights_direct", "hide_emitters": True}}
     with Children("scalar_rgb", LIMIT) as children:
         assert not children.ask(scene)
+
+
+def test_border_near_the_end_of_a_shadow_ray_is_passed_once(tmp_path):
+    """Rays to the far wall of a thin clear tube, which shines inwards, met it for ever: no end."""
+    scene = tmp_path / "tube.xml"
+    scene.write_text("""<scene version="3.0.0">
+        <integrator type="manylights_volpath"><integer name="max_depth" value="2"/></integrator>
+        <sensor type="perspective">
+            <float name="fov" value="20"/>
+            <transform name="to_world">
+                <lookat origin="1, -1, 1" target=".9, -.1, .6" up="0, 0, 1"/>
+            </transform>
+            <film type="hdrfilm">
+                <integer name="width" value="16"/> <integer name="height" value="16"/>
+            </film>
+        </sensor>
+        <shape type="rectangle">
+            <transform name="to_world"><translate z=".599"/></transform>
+        </shape>
+        <shape type="cylinder">
+            <transform name="to_world">
+                <scale value=".0001"/> <rotate x=".3" y=".4" z=".866" angle="50"/>
+                <translate x=".9" y="-.1" z=".6"/>
+            </transform>
+            <boolean name="flip_normals" value="true"/>
+            <bsdf type="null"/>
+            <emitter type="area"><rgb name="radiance" value="1"/></emitter>
+        </shape>
+    </scene>""")
+    image = tmp_path / "tube.exr"
+    options = ("--spp", 256, "--variant", "scalar_rgb")
+    process = manylights_process("render", scene, "-o", image, *options)
+    assert process.returncode == 0, process.stderr
+    assert np.isfinite(np.array(mi.Bitmap(str(image)))).all()
 
 
 # ------------------------------------------------------------------------------------ quadrature

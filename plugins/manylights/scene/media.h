@@ -286,7 +286,13 @@ private:
         value                          = si.to_world_mueller(value, si.wi, si.wi);
         dr::masked(s.result, s.active) = s.result * value;
         // It starts a little aside, so it has to be aimed again
-        Ray3f next                  = shadow_ray<Float, Spectrum>(si, to, close);
+        Ray3f next = shadow_ray<Float, Spectrum>(si, to, close);
+        // Curved borders near its end, and points beside these, would be met for ever
+        Float least = (1.f + dr::max(dr::abs(next.o))) * mitsuba::math::RayEpsilon<Float>,
+              missing = least - dr::dot(next.o - s.ray.o, s.ray.d);
+        missing       = dr::detach(dr::maximum(missing, 0.f));
+        next.o += missing * next.d;
+        next.maxt -= missing;
         Mask ahead                  = next.maxt > 0.f && dr::dot(next.d, s.ray.d) > 0.f;
         s.medium                    = medium_beyond(si, s.medium, s.ray.d, s.active);
         dr::masked(s.ray, s.active) = next;
