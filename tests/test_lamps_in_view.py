@@ -158,6 +158,36 @@ def test_hidden_lamps_stay_hidden(variant, integrator):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(
+    ("shape", "camera"), [("sphere", "pinhole"), ("sphere", "lens"), ("cylinder", "pinhole")]
+)
+def test_lamps_that_shine_inwards_are_dark_outside(variant, integrator, shape, camera):
+    """The wall that is nearer hides the one that shines, though both are of one lamp."""
+    lamps = {
+        f"ball_{i}": {**lamp(x, y if shape == "sphere" else 0, shape=shape), "flip_normals": True}
+        for i, (x, y) in enumerate(PLACES)
+    }
+    description = scene_of([], integrator=integrator, more=lamps, **CAMERAS[camera])
+    assert not images_of(description).any()
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_tubes_that_shine_inwards_are_seen_from_their_end(variant, integrator):
+    """What their near end covers less what is seen through the far one."""
+    radius, length = 0.02, 0.4
+    tube = {**lamp(0, 0, shape="cylinder"), "flip_normals": True, "radius": radius}
+    del tube["to_world"]
+    tube |= {"p0": [0, 0, DEPTH], "p1": [0, 0, DEPTH + length]}
+    description = scene_of([], integrator=integrator, more={"tube": tube})
+    near, far = (covered(np.pi * radius**2, z) for z in (DEPTH, DEPTH + length))
+    images = images_of(description, spp=512)
+    assert sums_agree(images, (near - far) * RADIANCE, bias=0.1)
+    assert not sums_agree(images * 1.1, (near - far) * RADIANCE)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, indirect=True)
 def test_lamps_at_the_border_of_the_film(variant):
     """Half of each is outside: of the sum, half is left."""
     right = DEPTH * np.tan(np.radians(FOV / 2))

@@ -95,6 +95,23 @@ struct CylinderLight : WithoutBeam {
                                           radial * row[7]));
     }
 
+    /// Is the point p, which shines inwards, behind its outside, seen from x? Where the line
+    /// between them enters the cylinder is closer to x, and between the ends.
+    template <typename Float>
+    static dr::mask_t<Float> hides(const Row<Float> &row,
+                                   const typename Row<Float>::Point3f &p,
+                                   const typename Row<Float>::Point3f &x) {
+        using Vector3f  = mitsuba::Vector<Float, 3>;
+        Vector3f axis   = row.vector(3), to_p(p - row.vector(0)), back(x - p);
+        Float scale     = dr::rcp(dr::squared_norm(axis)),
+              height_p  = dr::dot(to_p, axis) * scale,
+              height_d  = dr::dot(back, axis) * scale;
+        Vector3f radial = to_p - height_p * axis, across = back - height_d * axis;
+        Float share  = -2.f * dr::dot(radial, across) / dr::squared_norm(across),
+              height = dr::fmadd(share, height_d, height_p);
+        return row[7] < 0.f && share < 1.f && height > 0.f && height < 1.f;
+    }
+
     template <typename Float>
     static mitsuba::Vector<Float, 3> normal(const Row<Float> &row,
                                             const typename Row<Float>::Point3f &p) {

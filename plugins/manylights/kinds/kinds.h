@@ -89,6 +89,20 @@ dr::mask_t<Float> is_delta(const Row<Float> &row, KindSet kinds) {
     return result;
 }
 
+/// Does the outside of a light that shines inwards lie between its point p and x? Flat ones hide
+/// nothing of themselves.
+template <typename Float>
+dr::mask_t<Float> hides_itself(const Row<Float> &row, KindSet kinds,
+                               const mitsuba::Point<Float, 3> &p,
+                               const mitsuba::Point<Float, 3> &x) {
+    dr::mask_t<Float> result(false);
+    if (kinds.has(LightKind::Sphere))
+        result |= row.is(LightKind::Sphere) && SphereLight::hides(row, x);
+    if (kinds.has(LightKind::Cylinder))
+        result |= row.is(LightKind::Cylinder) && CylinderLight::hides(row, p, x);
+    return result;
+}
+
 /// Are there lights that shine to one side only, or in a cone?
 inline bool have_beams(KindSet kinds) {
     for (uint32_t i = 0; i < kMostKinds; ++i) {

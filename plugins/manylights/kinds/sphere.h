@@ -121,6 +121,13 @@ struct SphereLight : WithoutBeam {
         return dr::normalize(Vector3f(p - row.vector(0))) * row[4];
     }
 
+    /// Are points that shine inwards behind its outside, seen from x?
+    template <typename Float>
+    static dr::mask_t<Float> hides(const Row<Float> &row,
+                                   const typename Row<Float>::Point3f &x) {
+        return row[4] < 0.f && SphereCone<Float>(row.vector(0) - x, row[3]).outside;
+    }
+
     template <typename Float>
     static Float pdf(const Row<Float> &row, const typename Row<Float>::Point3f &x,
                      const typename Row<Float>::Point3f &p,

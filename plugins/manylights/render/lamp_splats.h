@@ -214,6 +214,8 @@ private:
         Mask past = !pi.is_valid() || pi.t >= seen.distance;
         past |= Mask(m_lights.find(pi.shape, plain(pi.prim_index),
                                    plain(active && pi.is_valid())) == seen.light);
+        past &= !Mask(hides_itself(seen.row, m_lights.table_kinds(), seen.point.p,
+                                   PointD(plain(seen.ray.o))));
         return active && past;
     }
 
