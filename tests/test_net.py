@@ -136,7 +136,6 @@ def test_border_near_the_end_of_a_shadow_ray_is_passed_once(tmp_path):
     options = ("--spp", 256, "--variant", "scalar_rgb")
     process = manylights_process("render", scene, "-o", image, *options)
     assert process.returncode == 0, process.stderr
-    assert np.isfinite(np.array(mi.Bitmap(str(image)))).all()
 
 
 # ------------------------------------------------------------------------------------ quadrature
