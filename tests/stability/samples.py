@@ -38,9 +38,9 @@ def integrator(name, **parameters):
     return mi.load_dict({"type": kind, **parameters})
 
 
-def single_samples(name, seeds=TAIL_SEEDS, size=TAIL_SIZE, **parameters):
+def single_samples(name, seeds=TAIL_SEEDS, **parameters):
     """Brightness of single samples of a case, (seeds, pixels)."""
-    return brightness(CASES[name].scene(), integrator(name, **parameters), seeds, size)
+    return brightness(CASES[name].scene(), integrator(name, **parameters), seeds)
 
 
 def reference_samples(name):
@@ -68,9 +68,9 @@ def reference_tail(name):
     return Tail(**json.loads(PERCENTILES.read_text())[name])
 
 
-def brightness(description, integrator, seeds=TAIL_SEEDS, size=TAIL_SIZE):
+def brightness(description, integrator, seeds=TAIL_SEEDS):
     """The same for any scene's dictionary."""
-    scene = load(description, size)
+    scene = load(description, TAIL_SIZE)
     images = tools.render_seeds(scene, integrator, spp=1, seeds=range(seeds))
     return images.mean(axis=-1).reshape(seeds, -1)
 
