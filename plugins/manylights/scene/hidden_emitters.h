@@ -3,6 +3,7 @@
 /// The parameter `hide_emitters`: what a camera sees behind the area emitters.
 
 #include "manylights/base/loop.h"
+#include "shadow_ray.h"
 #include <mitsuba/render/interaction.h>
 #include <mitsuba/render/scene.h>
 
@@ -26,9 +27,6 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
         return s.active && s.pi.is_valid() && s.pi.shape != nullptr &&
                s.pi.shape->emitter() != nullptr;
     };
-    auto epsilon = [](const auto &p) { // that of Mitsuba's rays
-        return (1.f + dr::max(dr::abs(p))) * mitsuba::math::RayEpsilon<Float>;
-    };
     loop(
         state, on_emitter,
         [&](State &s) {
@@ -38,7 +36,7 @@ void skip_emitters(const Scene *scene, const Ray3f &ray, Intersection &pi, Mask 
                                                        s.active);
             Ray3f next = si.spawn_ray(ray.d);
             // Along a surface the offset from it does not get ahead, and it is met for ever
-            Float least = s.passed + s.pi.t + epsilon(si.p),
+            Float least = s.passed + s.pi.t + ray_epsilon<Float>(si.p),
                   ahead = dr::dot(next.o - ray.o, ray.d);
             s.passed    = dr::maximum(least, ahead);
             next.o += ray.d * (s.passed - ahead);

@@ -288,8 +288,7 @@ private:
         // It starts a little aside, so it has to be aimed again
         Ray3f next = shadow_ray<Float, Spectrum>(si, to, close);
         // Curved borders near its end, and points beside these, would be met for ever
-        Float least = (1.f + dr::max(dr::abs(next.o))) * mitsuba::math::RayEpsilon<Float>,
-              missing = least - dr::dot(next.o - s.ray.o, s.ray.d);
+        Float missing = ray_epsilon<Float>(next.o) - dr::dot(next.o - s.ray.o, s.ray.d);
         missing       = dr::detach(dr::maximum(missing, 0.f));
         next.o += missing * next.d;
         next.maxt -= missing;

@@ -18,6 +18,11 @@ dr::mask_t<Float> may_end_close(const Row<Float> &row, const KindSet &kinds) {
     return result;
 }
 
+/// How far from a surface at p Mitsuba's rays start
+template <typename Float> Float ray_epsilon(const mitsuba::Point<Float, 3> &p) {
+    return (1.f + dr::max(dr::abs(p))) * mitsuba::math::RayEpsilon<Float>;
+}
+
 /**
  * The ray from a surface or a point in a medium to a point of a light. Mitsuba's `spawn_ray_to`
  * ends it at a share of its length: far lamps shine through their shades, and bulbs with smooth
@@ -27,10 +32,10 @@ template <typename Float, typename Spectrum>
 mitsuba::Ray<mitsuba::Point<Float, 3>, Spectrum>
 shadow_ray(const mitsuba::Interaction<Float, Spectrum> &from,
            const mitsuba::Point<Float, 3> &to, const dr::mask_t<Float> &close) {
-    using mitsuba::math::RayEpsilon, mitsuba::math::ShadowEpsilon;
+    using mitsuba::math::ShadowEpsilon;
     auto ray                    = from.spawn_ray_to(to);
     Float distance              = ray.maxt / (1.f - ShadowEpsilon<Float>),
-          gap                   = (1.f + dr::max(dr::abs(to))) * RayEpsilon<Float>;
+          gap                   = ray_epsilon<Float>(to);
     dr::masked(ray.maxt, close) = dr::maximum(ray.maxt, distance - gap);
     return ray;
 }
