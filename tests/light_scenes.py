@@ -51,7 +51,7 @@ def sensor():
             "pixel_format": "rgb",
             "component_format": "float32",
         },
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "manylights_sobol"},
     }
 
 

@@ -52,11 +52,11 @@ def scene_names():
     return sorted(path.stem for path in SCENE_FOLDER.glob("*.xml"))
 
 
-def load_scene(name, integrator="keep"):
-    """Load a scene with the size of the references, and another integrator if one is named."""
+def load_scene(name, integrator="keep", sampler="keep"):
+    """Load a scene with the size of the references, another integrator or sampler if named."""
     size = {"resx": str(WIDTH), "resy": str(HEIGHT)}
     path = str(SCENE_FOLDER / f"{name}.xml")
-    return loading.load(path, size, integrator, sampler="keep").scene
+    return loading.load(path, size, integrator, sampler=sampler).scene
 
 
 def load_without_area_lights(name):

@@ -46,6 +46,9 @@ PILOTS = 4
 
 The fewer there are, the more samples are rendered to be safe."""
 
+REFERENCE_PILOTS = 16
+"""The same for references, all in one wavefront."""
+
 LONG_PILOTS = 32
 """As many where few pixels have nearly all of the variance of these."""
 
@@ -113,7 +116,7 @@ def planned_images(scene, integrator, error, first_seed, sensor=0, known=False):
 def pilot_count(independent, known):
     """How many short renderings: as many as a reference has where one wavefront traces them all."""
     if known and independent and not mi.variant().startswith("scalar"):
-        return REFERENCE_SEEDS
+        return REFERENCE_PILOTS
     return PILOTS if independent and not known else 2 * PILOTS
 
 
@@ -176,7 +179,7 @@ def wavefront(scene, integrator, spp, seed, count, sensor):
     """
     width, height = (int(value) for value in sensor.film().crop_size())
     samples = width * height * spp * count
-    sampler = sensor.sampler().clone()
+    sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, seed), samples)
     pixel = dr.arange(mi.UInt32, samples) // dr.opaque(mi.UInt32, spp)
     place = mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()

@@ -298,7 +298,7 @@ ROULETTE += [pytest.param("wall.bsdf.reflectance.value", 1, id="roulette")]
 
 
 def black_scene():
-    """Three points above a floor, a wall and a cube of fog, all black."""
+    """Two points above a floor, a wall and a cube of fog, all black."""
     to_world = path_scenes.transform().look_at([0, -4, 3], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 12, "height": 8, "rfilter": {"type": "box"}}
     fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": ZERO}
@@ -319,7 +319,7 @@ def black_scene():
             "interior": fog,
         },
     }
-    for index in range(3):
+    for index in range(2):
         position = [index - 1.0, 0.3 * index, 1.0]
         scene[f"lamp_{index}"] = {"type": "point", "position": position, "intensity": ZERO}
     return scene
@@ -335,7 +335,7 @@ def test_gradients_at_zero_are_differences(llvm, key, rr_depth):
     value, depth = AT_ZERO[key]
     scene = mi.load_dict(black_scene())
     parameters = mi.traverse(scene)
-    for name in (*AT_ZERO, "lamp_1.intensity.value", "lamp_2.intensity.value"):
+    for name in (*AT_ZERO, "lamp_1.intensity.value"):
         parameters[name] = mi.Color3f(0.0 if name == key else 0.5)
     if depth == 2:
         parameters["wall.bsdf.reflectance.value"] = mi.Color3f(0.0)

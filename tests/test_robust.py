@@ -158,7 +158,7 @@ def test_timeout_does_not_cut_a_kernel(llvm, name):
 
 # ----------------------------------------------------------------------------------------- memory
 
-REPEATS, WARM_UP = 50, 5
+REPEATS, WARM_UP = 30, 5
 
 WATCH_MEMORY = """
 import ctypes, gc, json, sys
@@ -224,9 +224,9 @@ print(json.dumps({"grown": used[-1] - used[0], "tree": tree}))
     ],
 )
 def test_memory_does_not_grow(variant, action, name, lights):
-    """Fifty renders, rebuilds or scenes need no more than five.
+    """Thirty renders, rebuilds or scenes need no more than five.
 
-    A tree that is not released each time would be kept 45 times. A fifth of that is allowed, 6 MB
+    A tree that is not released each time would be kept 25 times. A fifth of that is allowed, 3 MB
     with 5,000 lights: the noise of allocators is below 1 MB. Needs a process of its own, since a
     leak may fill what others have released before.
     """

@@ -63,7 +63,7 @@ def camera(size=0.5, target=(0, 0, 0), origin=(0, 0, 0.5), near=1e-2, rfilter="b
             "pixel_format": "rgb",
             "component_format": "float32",
         },
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "manylights_sobol"},
     }
 
 

@@ -61,7 +61,7 @@ def ratio(values, median):
 def measure(name):
     """A line of the table, and the tail of the reference."""
     case = CASES[name]
-    pair = [samples.single_samples(name), samples.reference_samples(name)]
+    pair = [samples.single_samples(name, samples.MILLION_SEEDS), samples.reference_samples(name)]
     tail = asdict(samples.tail_of(pair[1]))
     if case.black:
         assert not pair[0].any()

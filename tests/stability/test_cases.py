@@ -85,7 +85,7 @@ def test_light_at_the_receiver_does_not_empty_reservoirs(llvm):
 @pytest.mark.parametrize("name", ["inside-cluster", "bright-far", "edge-on"])
 def test_mean_with_one_sample_per_pixel(llvm, name):
     """A million pixels of one sample have the mean of the reference."""
-    values = samples.single_samples(name)
+    values = samples.single_samples(name, samples.MILLION_SEEDS)
     reference = samples.reference_images(name, llvm).mean(axis=(1, 2, 3))
     comparison = tools.compare_means(
         values.mean(axis=1).reshape(-1, 1, 1, 1), reference.reshape(-1, 1, 1, 1), tile=1
@@ -100,7 +100,8 @@ UNITS = (1e-4, 1e-2, 1e2, 1e5)
 @shared
 def noise(scale):
     """Relative variance of a sample in units of that scale, once for each seed."""
-    values = samples.brightness(units(scale)(), mi.load_dict({"type": "manylights_direct"}))
+    default = mi.load_dict({"type": "manylights_direct"})
+    values = samples.brightness(units(scale)(), default, samples.MILLION_SEEDS)
     return values.var(axis=1) / values.mean(axis=1) ** 2
 
 
