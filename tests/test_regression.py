@@ -26,9 +26,9 @@ pytestmark = pytest.mark.usefixtures("plugin")
 FIRST_SEED = 1000
 IMAGES, SAMPLES = 6, 12
 
-# With more images the variance is better known: of the glass in fog, where light is found by chance
-# only. Visibility is learnt from 2^16 samples, 11 per pixel.
-EFFORT_OF = {"glass_fog": (12, 12)}
+# With more images the variance is better known: of glass in fog and of smoke, where light is found
+# by chance. Visibility is learnt from 2^16 samples, 11 per pixel.
+EFFORT_OF = {"glass_fog": (20, 12), "heterogeneous": (20, 12)}
 BIAS_OF = {"no_lights": None}
 
 

@@ -67,7 +67,8 @@ std::vector<Parameter> make_table() {
         with(text("split_function", { "near", "far" }),
              "how the probability of splitting decays with distance", { M::Talk }),
         with(number("splitting_rate", 1, { "inf" }),
-             "candidates at a point, in units of 16 or, on paths, of 6, 4 and 2",
+             "candidates at a point, in units of 16, on paths of 6, 4 and 2, in media "
+             "half",
              { M::ResampledTree, M::Talk, M::AdaptiveSplitting }),
         with(integer("reservoirs", kBoth, 16, 1, kMaxReservoirs),
              "lights that are kept for a full evaluation",

@@ -124,8 +124,7 @@ SamplingParameters read_parameters(const Properties &props) {
 SamplingParameters read_path_parameters(const Properties &props) {
     SamplingParameters p = read(props, kVolpath);
     int64_t max_depth    = props.get<int64_t>("max_depth", -1);
-    if (max_depth < 0 || max_depth > 2)
-        p.effort = kSeveralBounces;
+    p.several_bounces    = max_depth < 0 || max_depth > 2;
     return p;
 }
 

@@ -7,25 +7,15 @@
 
 #include "group_names.h"
 #include "parameter_table.h"
-#include <algorithm>
-#include <cmath>
 #include <cstdint>
-#include <limits>
 #include <mitsuba/core/properties.h>
 #include <string>
 #include <vector>
 
 namespace manylights {
 
-/// K above which systematic sampling would lose the fraction of a float: visit all lights
-constexpr float kMaxExpectedCandidates = 1 << 14;
-/// K for a splitting rate of 1: at the first vertex, how much less at each that follows, and at
-/// least. Rays that lead to the vertices of a path cost as much as shadow rays, and light that has
-/// been reflected is dimmer: fewer pay on paths, and fewer from vertex to vertex.
-struct Effort {
-    float first, less, least;
-};
-constexpr Effort kOneBounce{ 16.f, 0.f, 16.f }, kSeveralBounces{ 6.f, 2.f, 2.f };
+/// Above it systematic sampling would lose the fraction of a float: visit all lights
+constexpr float kMaxSplittingRate = 1 << 10;
 
 /// What decides whether a node is split: the talk's two functions, or the variance
 enum class SplitFunction { Near, Far, Variance };
@@ -39,7 +29,8 @@ struct SamplingParameters {
     Method method;
     SplitFunction split_function;
     float splitting_rate;
-    Effort effort = kOneBounce;
+    /// May paths have more vertices than one? (strategy.h)
+    bool several_bounces = false;
     uint32_t reservoirs, shadow_rays, bsdf_samples;
     /// Are the candidates and the visited nodes counted, in film channels?
     bool counts;
@@ -47,15 +38,6 @@ struct SamplingParameters {
     /// Groups of lights that have film layers of their own
     GroupNames light_groups;
 
-    /// Expected number of candidates K at the first vertex, at least one
-    float expected_candidates() const {
-        return std::max(1.f, effort.first * splitting_rate);
-    }
-    /// Upper limit of the number of candidates
-    float most_candidates() const {
-        return splits_nodes() ? std::numeric_limits<float>::infinity()
-                              : std::ceil(expected_candidates());
-    }
     /// Does it walk the binary tree, and split its nodes one by one?
     bool splits_nodes() const {
         return method == Method::Talk || method == Method::AdaptiveSplitting;
@@ -64,7 +46,7 @@ struct SamplingParameters {
     bool traces_all() const { return method == Method::AdaptiveSplitting; }
     /// Is every one of so many lights a candidate, without a tree?
     bool considers_all(uint32_t lights) const {
-        return lights <= reservoirs || expected_candidates() > kMaxExpectedCandidates;
+        return lights <= reservoirs || splitting_rate > kMaxSplittingRate;
     }
 };
 

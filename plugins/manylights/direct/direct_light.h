@@ -36,9 +36,9 @@ public:
     DirectLight(const Scene *scene, const Lights &lights,
                 const SamplingParameters &params, const MediaKinds &media = {})
         : m_lights(lights), m_emission(scene, lights), m_media(scene, media),
-          m_strategy(params, lights.tree().light_count,
-                     (uint32_t) lights.infinite().size(),
-                     has_exact_targets(lights, media)),
+          m_strategy(
+              params, lights.tree().light_count, (uint32_t) lights.infinite().size(),
+              media.homogeneous || media.heterogeneous, has_exact_targets(lights, media)),
           m_mis(params.bsdf_samples > 0 &&
                 (lights.can_be_hit() || scene->environment() != nullptr)),
           m_samples(lights, m_emission, m_strategy, m_mis),

@@ -24,6 +24,8 @@
 #include "manylights/choice/systematic.h"
 #include "vertex.h"
 #include <algorithm>
+#include <cmath>
+#include <limits>
 
 namespace manylights {
 
@@ -32,6 +34,29 @@ enum class Source { AllLights, Systematic, Splitting };
 
 /// What becomes of candidates: a shadow ray for each, a slot for each, or resampling
 enum class Fate { TraceAll, KeepAll, Resample };
+
+/// K for a splitting rate of 1: at the first vertex, how much less at each that follows, and at
+/// least. Rays that lead to the vertices of a path cost as much as shadow rays, and light that has
+/// been reflected is dimmer: fewer pay on paths, and fewer from vertex to vertex.
+struct Effort {
+    float first, less, least;
+
+    /// K at a vertex after `depth` others, at least one
+    template <typename Float, typename UInt32>
+    Float candidates(const Float &splitting_rate, const UInt32 &depth) const {
+        Float k(first);
+        if (less > 0.f)
+            k = dr::maximum(k - less * Float(depth), least);
+        return dr::maximum(k * splitting_rate, 1.f);
+    }
+};
+
+/// In media a piece of a path asks twice, for its segment and for its end
+inline Effort effort_of(const SamplingParameters &params, bool in_media) {
+    if (!params.several_bounces)
+        return { 16.f, 0.f, 16.f };
+    return in_media ? Effort{ 3.f, 1.f, 1.f } : Effort{ 6.f, 2.f, 2.f };
+}
 
 /*
  * The sources: `cursor` starts at the first candidate of a vertex, with its random number of
@@ -57,15 +82,6 @@ template <typename FloatD> struct SystematicSource {
     using UInt32D = dr::uint32_array_t<FloatD>;
     using MaskD   = dr::mask_t<FloatD>;
     FloatD expected;
-
-    /// Fewer from vertex to vertex of a path, see \ref Effort
-    SystematicSource(const SamplingParameters &params, const UInt32D &depth)
-        : expected(params.effort.first) {
-        if (params.effort.less > 0.f)
-            expected = dr::maximum(expected - params.effort.less * FloatD(depth),
-                                   params.effort.least);
-        expected = dr::maximum(expected * dr::opaque<FloatD>(params.splitting_rate), 1.f);
-    }
 
     template <typename Vertex>
     auto cursor(const TreeView<FloatD> &, const Vertex &vertex, const FloatD &u) const {
@@ -107,6 +123,7 @@ private:
 /// See the top of the file
 struct Strategy {
     const SamplingParameters &params;
+    Effort effort;
     Source source;
     Fate fate;
     /// Does h or H compare lights with each other?
@@ -122,15 +139,16 @@ struct Strategy {
     /// That pays in scalar variants; in LLVM variants each slot is written with a selection.
     bool keeps_samples;
 
+    /// @param in_media       may vertices lie in media?
     /// @param exact_targets  does a target come from the sample that its ray would get?
     Strategy(const SamplingParameters &params, uint32_t lights, uint32_t infinite_lights,
-             bool exact_targets)
-        : params(params) {
+             bool in_media, bool exact_targets)
+        : params(params), effort(effort_of(params, in_media)) {
         bool all      = params.considers_all(lights);
         source        = all                     ? Source::AllLights
                         : params.splits_nodes() ? Source::Splitting
                                                 : Source::Systematic;
-        float most    = all ? (float) lights : params.most_candidates();
+        float most    = all ? (float) lights : most_candidates();
         bool fits     = most <= (float) params.reservoirs;
         bool few      = infinite_lights <= kMaxInfinite;
         slots         = fits ? std::min((uint32_t) most, lights) : params.reservoirs;
@@ -151,13 +169,22 @@ struct Strategy {
     auto with_source(const dr::uint32_array_t<FloatD> &depth, const F &f) const {
         switch (source) {
             case Source::Systematic:
-                return f(SystematicSource<FloatD>(params, depth));
+                return f(SystematicSource<FloatD>{ effort.candidates(
+                    dr::opaque<FloatD>(params.splitting_rate), depth) });
             case Source::Splitting:
                 return f(SplittingSource<FloatD>{ params });
             case Source::AllLights:
                 break;
         }
         return f(AllLightsSource<FloatD>{ params });
+    }
+
+private:
+    /// Upper limit of their number at any vertex
+    float most_candidates() const {
+        return params.splits_nodes()
+                   ? std::numeric_limits<float>::infinity()
+                   : std::ceil(effort.candidates(params.splitting_rate, 0u));
     }
 };
 
