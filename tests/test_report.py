@@ -159,6 +159,16 @@ def test_gain_compares_errors_after_the_same_time():
         assert ratio.value == pytest.approx(error / 0.1)
 
 
+def test_what_does_not_grow_with_the_samples_does_not_count():
+    """Longer renders would have the same ratio."""
+    ours = series_of([(1, 1.5, 1.0), (4, 3.0, 0.25)])
+    for preparation in (0.0, 0.5, 20.0):
+        peer = series_of([(spp, preparation + 0.1 * spp, 8 / spp) for spp in (16, 32)])
+        ratio = statistics.gain(peer, ours, scene_of(ours, peer))
+        assert ratio.value == pytest.approx(8 * 0.1 / 0.5)
+        assert statistics.sample_seconds(peer) == pytest.approx(0.1)
+
+
 def test_points_at_the_error_of_the_reference_are_not_used():
     series = series_of([(1, 1.0, 1.0), (4, 4.0, 0.25), (16, 16.0, 0.11)])
     scene = scene_of(series, error=0.02)

@@ -9,7 +9,7 @@ from manylights import files
 from manylights.bench.methods import ABOUT, MITSUBAS, OURS
 from manylights.bench.records import Results, Scene, Series
 from manylights.report import grouping, tables
-from manylights.report.statistics import gain, last_clear_point, nanoseconds_per_sample
+from manylights.report.statistics import gain, sample_seconds
 from manylights.report.text import number, percent, ratio
 
 NAME = "README.md"
@@ -116,9 +116,10 @@ def _comparison(data: Results) -> list[str]:
     return [
         "## Error after the same time, ours = 1",
         f"Error of each method, with its best setting, divided by that of `{OURS[0]}` as it comes, "
-        "after the time of the longest renders of ours. The error of a peer is taken to be a power "
-        "of the time between its measurements, and to fall as 1 / time outside. Above 1 ours is "
-        "better.",
+        "after the time of the longest renders of ours. Times are without what does not grow with "
+        "the samples, such as recorded kernels: intercept and slope of the two longest renders. "
+        "The error of a peer is taken to be a power of the time between its measurements, and to "
+        "fall as 1 / time outside. Above 1 ours is better.",
         _table(heads, rows),
         about,
         *_samplers(data),
@@ -159,9 +160,7 @@ def _gain(peer: Series | None, ours: Series, scene: Scene) -> str:
 def _nanoseconds(scene: Scene, best: dict[str, Series]) -> str:
     """Return the time of a sample of Mitsuba's uniform sampling and of ours."""
     return ", ".join(
-        number(nanoseconds_per_sample(last_clear_point(best[name], scene), scene).value)
-        if name in best
-        else "-"
+        number(1e9 * sample_seconds(best[name]) / scene.pixels) if name in best else "-"
         for name in (MITSUBAS[0], OURS[0])
     )
 

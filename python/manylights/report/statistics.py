@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
+from manylights.bench import calibration
 from manylights.bench.records import Point, Scene, Series
 
 #: Two-sided level of all intervals.
@@ -104,17 +105,17 @@ def last_clear_point(series: Series, scene: Scene) -> Point:
 
 def cost(series: Series, scene: Scene, metric: str = "error_trimmed") -> SampleMean:
     """The logarithm of error times time: the error after one second if it falls as 1 / time."""
-    return _point_cost(last_clear_point(series, scene), metric)
+    return _point_cost(last_clear_point(series, scene), series, metric)
 
 
 def gain(peer: Series, ours: Series, scene: Scene, metric: str = "error_trimmed") -> Interval:
     """Error of ``peer`` divided by that of ``ours`` after the same time: above 1, ours is better.
 
-    The time is that of the longest renderings of ours. The error of a peer is a power of the time
-    between its measurements and falls as 1 / time outside of them: what a render takes before its
-    first sample makes the slope at the ends too steep.
+    The time is that of the longest renderings of ours, without what does not grow with the samples.
+    The error of a peer is a power of the time between its measurements and falls as 1 / time
+    outside of them.
     """
-    time = _seconds(last_clear_point(ours, scene))
+    time = _growing_seconds(last_clear_point(ours, scene), ours)
     return (_cost_at(time, peer, scene, metric) - cost(ours, scene, metric)).exp_interval()
 
 
@@ -122,19 +123,30 @@ def _seconds(point: Point) -> float:
     return float(point.seconds.mean())
 
 
-def _point_cost(point: Point, metric: str) -> SampleMean:
-    return log_mean_of(getattr(point, metric) * point.seconds)
+def sample_seconds(series: Series) -> float:
+    """Seconds of one more sample per pixel."""
+    return calibration.line({point.spp: _seconds(point) for point in series.points})[1]
+
+
+def _growing_seconds(point: Point, series: Series) -> float:
+    """Seconds of a rendering without what it takes before its first sample: recorded kernels."""
+    return sample_seconds(series) * point.spp
+
+
+def _point_cost(point: Point, series: Series, metric: str) -> SampleMean:
+    seconds = point.seconds * (_growing_seconds(point, series) / _seconds(point))
+    return log_mean_of(getattr(point, metric) * seconds)
 
 
 def _cost_at(time: float, series: Series, scene: Scene, metric: str) -> SampleMean:
     """The logarithm of error times time is linear in that of the time: see :func:`gain`."""
     points = clear_points(series, scene) or series.points[:1]
-    times = [_seconds(point) for point in points]
+    times = [_growing_seconds(point, series) for point in points]
     if not times[0] < time < times[-1]:
-        return _point_cost(points[0 if time <= times[0] else -1], metric)
+        return _point_cost(points[0 if time <= times[0] else -1], series, metric)
     first = int(np.searchsorted(times, time)) - 1
     place = math.log(time / times[first]) / math.log(times[first + 1] / times[first])
-    before, after = (_point_cost(point, metric) for point in points[first : first + 2])
+    before, after = (_point_cost(point, series, metric) for point in points[first : first + 2])
     return before.scaled(1 - place) - after.scaled(-place)
 
 
