@@ -109,7 +109,7 @@ def ramp(sampler, spp):
     """A camera that sees a ramp of radiance, in a scene with so many lights that it is learnt."""
     ramp = np.repeat(np.linspace(0, 1, 97, dtype=np.float32)[None, :, None], 2, axis=0)
     bitmap = {"type": "bitmap", "data": mi.TensorXf(ramp), "raw": True, "wrap_mode": "clamp"}
-    film = {"type": "hdrfilm", "width": 96, "height": 96, "rfilter": {"type": "box"}}
+    film = {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
     scene = {
         "type": "scene",
         "screen": {"type": "rectangle", "emitter": {"type": "area", "radiance": bitmap}},
