@@ -166,7 +166,25 @@ def test_what_does_not_grow_with_the_samples_does_not_count():
         peer = series_of([(spp, preparation + 0.1 * spp, 8 / spp) for spp in (16, 32)])
         ratio = statistics.gain(peer, ours, scene_of(ours, peer))
         assert ratio.value == pytest.approx(8 * 0.1 / 0.5)
-        assert statistics.sample_seconds(peer) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("seconds", [(10.0, 10.1), (10.0, 9.0)])
+def test_samples_are_never_free(seconds):
+    """Where noise is all that grows, a sample takes a tenth of its share."""
+    peer = series_of([(16, seconds[0], 1.0), (32, seconds[1], 0.5)])
+    found = statistics.sample_seconds(peer).exp_interval().value
+    assert found == pytest.approx(0.1 * seconds[1] / 32)
+    assert statistics.is_mostly_preparation(peer)
+    assert not statistics.is_mostly_preparation(series_of([(16, 1.0, 1.0), (32, 1.5, 0.5)]))
+
+
+def test_times_of_samples_have_intervals():
+    series = series_of([(1, 1.5, 1.0), (4, 3.0, 0.25)])
+    series.points[1].seconds[:] = [2.7, 3.0, 3.3]
+    slopes = np.array([1.2, 1.5, 1.8]) / 3
+    found = statistics.sample_seconds(series)
+    assert found.exp_interval().value == pytest.approx(slopes.mean())
+    assert found.variance == pytest.approx(slopes.var(ddof=1) / 3 / slopes.mean() ** 2)
 
 
 def test_points_at_the_error_of_the_reference_are_not_used():

@@ -68,7 +68,7 @@ def samples_in(times: dict[int, float], seconds: float) -> int:
         times: measured seconds for numbers of samples.
         seconds: what to fill.
     """
-    intercept, slope = line(times)
+    intercept, slope = _line(times)
     return max(1, round((seconds - intercept) / slope))
 
 
@@ -76,7 +76,7 @@ def predict(times: dict[int, float], spp: int) -> float:
     """Return the seconds that ``spp`` samples are expected to take."""
     if spp in times:
         return times[spp]
-    intercept, slope = line(times)
+    intercept, slope = _line(times)
     return intercept + slope * spp
 
 
@@ -88,11 +88,8 @@ def _lower_bound(times: dict[int, float], spp: int) -> float:
     return predict(times, spp) if len(times) > 1 else max(times.values())
 
 
-def line(times: dict[int, float]) -> tuple[float, float]:
-    """Return what does not grow with the samples and the seconds of one more.
-
-    They are intercept and slope through the two largest numbers of samples.
-    """
+def _line(times: dict[int, float]) -> tuple[float, float]:
+    """Return intercept and slope through the two largest numbers of samples."""
     points = sorted(times.items())[-2:]
     if len(points) == 1:
         ((spp, seconds),) = points

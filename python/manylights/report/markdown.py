@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from manylights import files
 from manylights.bench.methods import ABOUT, MITSUBAS, OURS
 from manylights.bench.records import Results, Scene, Series
 from manylights.report import grouping, tables
-from manylights.report.statistics import gain, sample_seconds
+from manylights.report.statistics import gain, is_mostly_preparation, sample_seconds
 from manylights.report.text import number, percent, ratio
 
 NAME = "README.md"
@@ -117,9 +118,10 @@ def _comparison(data: Results) -> list[str]:
         "## Error after the same time, ours = 1",
         f"Error of each method, with its best setting, divided by that of `{OURS[0]}` as it comes, "
         "after the time of the longest renders of ours. Times are without what does not grow with "
-        "the samples, such as recorded kernels: intercept and slope of the two longest renders. "
+        "the samples, such as recorded kernels: the slope between the two longest renders counts. "
         "The error of a peer is taken to be a power of the time between its measurements, and to "
-        "fall as 1 / time outside. Above 1 ours is better.",
+        'fall as 1 / time outside. Above 1 ours is better; "<": renders of the peer are mostly '
+        "preparation, and a tenth of their time is taken for that of the samples.",
         _table(heads, rows),
         about,
         *_samplers(data),
@@ -154,13 +156,17 @@ def _measured(data: Results, method: str) -> bool:
 
 
 def _gain(peer: Series | None, ours: Series, scene: Scene) -> str:
-    return "" if peer is None else number(gain(peer, ours, scene).value)
+    if peer is None:
+        return ""
+    return "< " * is_mostly_preparation(peer) + number(gain(peer, ours, scene).value)
 
 
 def _nanoseconds(scene: Scene, best: dict[str, Series]) -> str:
     """Return the time of a sample of Mitsuba's uniform sampling and of ours."""
     return ", ".join(
-        number(1e9 * sample_seconds(best[name]) / scene.pixels) if name in best else "-"
+        number(1e9 * math.exp(sample_seconds(best[name]).value) / scene.pixels)
+        if name in best
+        else "-"
         for name in (MITSUBAS[0], OURS[0])
     )
 

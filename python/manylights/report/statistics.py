@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from manylights.bench import calibration
 from manylights.bench.records import Point, Scene, Series
 
 #: Two-sided level of all intervals.
@@ -26,6 +25,9 @@ CLEARLY_ABOVE = 10.0
 
 #: How far beyond its measurements a series is continued, with error times time constant.
 MAX_EXTRAPOLATION = 10.0
+
+#: The least share of a rendering's mean time per sample that one more sample is taken to need.
+LEAST_SLOPE = 0.1
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,15 @@ class SampleMean:
     variance: float
     freedom: float
 
-    def __sub__(self, other: SampleMean) -> SampleMean:
-        """The difference of two independent estimates, after Welch and Satterthwaite."""
+    def __add__(self, other: SampleMean) -> SampleMean:
+        """The sum of two independent estimates, after Welch and Satterthwaite."""
         total = self.variance + other.variance
         parts = self.variance**2 / self.freedom + other.variance**2 / other.freedom
         freedom = total**2 / parts if parts > 0 else math.inf
-        return SampleMean(self.value - other.value, total, freedom)
+        return SampleMean(self.value + other.value, total, freedom)
+
+    def __sub__(self, other: SampleMean) -> SampleMean:
+        return self + other.scaled(-1)
 
     def scaled(self, factor: float) -> SampleMean:
         return SampleMean(factor * self.value, factor**2 * self.variance, self.freedom)
@@ -104,7 +109,10 @@ def last_clear_point(series: Series, scene: Scene) -> Point:
 
 
 def cost(series: Series, scene: Scene, metric: str = "error_trimmed") -> SampleMean:
-    """The logarithm of error times time: the error after one second if it falls as 1 / time."""
+    """The logarithm of error times time, without what does not grow with the samples.
+
+    It is the error after one second if that falls as 1 / time.
+    """
     return _point_cost(last_clear_point(series, scene), series, metric)
 
 
@@ -115,7 +123,7 @@ def gain(peer: Series, ours: Series, scene: Scene, metric: str = "error_trimmed"
     The error of a peer is a power of the time between its measurements and falls as 1 / time
     outside of them.
     """
-    time = _growing_seconds(last_clear_point(ours, scene), ours)
+    time = math.exp(sample_seconds(ours).value) * last_clear_point(ours, scene).spp
     return (_cost_at(time, peer, scene, metric) - cost(ours, scene, metric)).exp_interval()
 
 
@@ -123,31 +131,52 @@ def _seconds(point: Point) -> float:
     return float(point.seconds.mean())
 
 
-def sample_seconds(series: Series) -> float:
-    """Seconds of one more sample per pixel."""
-    return calibration.line({point.spp: _seconds(point) for point in series.points})[1]
+def sample_seconds(series: Series) -> SampleMean:
+    """The logarithm of the seconds of one more sample per pixel.
+
+    It is the slope between the two longest renderings, so that what they take before their first
+    sample does not count. Noise must not make samples free: a tenth of the mean is the least.
+    """
+    whole = log_mean_of(series.points[-1].seconds / series.points[-1].spp)
+    if len(series.points) == 1:
+        return whole
+    slope, mean = _slope(series), math.exp(whole.value)
+    value = min(max(slope.value, LEAST_SLOPE * mean), mean)
+    return SampleMean(math.log(value), slope.variance / value**2, slope.freedom)
 
 
-def _growing_seconds(point: Point, series: Series) -> float:
-    """Seconds of a rendering without what it takes before its first sample: recorded kernels."""
-    return sample_seconds(series) * point.spp
+def is_mostly_preparation(series: Series) -> bool:
+    """Whether the renderings are too short to tell what one more sample takes."""
+    last = series.points[-1]
+    mean = _seconds(last) / last.spp
+    return len(series.points) > 1 and _slope(series).value < LEAST_SLOPE * mean
+
+
+def _slope(series: Series) -> SampleMean:
+    """Seconds per sample between the two longest renderings."""
+    before, last = series.points[-2:]
+    count = min(len(before.seconds), len(last.seconds))
+    return mean_of((last.seconds[:count] - before.seconds[:count]) / (last.spp - before.spp))
 
 
 def _point_cost(point: Point, series: Series, metric: str) -> SampleMean:
-    seconds = point.seconds * (_growing_seconds(point, series) / _seconds(point))
-    return log_mean_of(getattr(point, metric) * seconds)
+    error = log_mean_of(getattr(point, metric))
+    return error + sample_seconds(series) + SampleMean(math.log(point.spp), 0.0, math.inf)
 
 
 def _cost_at(time: float, series: Series, scene: Scene, metric: str) -> SampleMean:
-    """The logarithm of error times time is linear in that of the time: see :func:`gain`."""
+    """The logarithm of error times time; that of the error is linear in it: see :func:`gain`."""
     points = clear_points(series, scene) or series.points[:1]
-    times = [_growing_seconds(point, series) for point in points]
+    seconds = sample_seconds(series)
+    times = [math.exp(seconds.value) * point.spp for point in points]
     if not times[0] < time < times[-1]:
         return _point_cost(points[0 if time <= times[0] else -1], series, metric)
     first = int(np.searchsorted(times, time)) - 1
     place = math.log(time / times[first]) / math.log(times[first + 1] / times[first])
-    before, after = (_point_cost(point, series, metric) for point in points[first : first + 2])
-    return before.scaled(1 - place) - after.scaled(-place)
+    before, after = (log_mean_of(getattr(point, metric)) for point in points[first : first + 2])
+    error = before.scaled(1 - place) + after.scaled(place)
+    # The slope's own error moves the place between the two points
+    return error + SampleMean(math.log(time), seconds.variance, seconds.freedom)
 
 
 def bias(series: Series, scene: Scene) -> Interval:
