@@ -29,7 +29,7 @@ Volumetric path tracer for many lights (:monosp:`manylights_volpath`)
  * - splitting_rate
    - |float|
    - How many lights are considered at the vertices of a path: about 6 times this number at the
-     first, 4 times at the second and twice at all others, half as many in scenes with media, or
+     first, 4 times at the second and twice at all others, half of it where media scatter, or
      16 times if :code:`max_depth` allows for direct light and single scattering only, from 0 (a
      single random descent of the tree) to infinity (:code:`inf`: every light). (Default: 1)
 

@@ -46,11 +46,11 @@ PILOTS = 4
 
 The fewer there are, the more samples are rendered to be safe."""
 
-REFERENCE_PILOTS = 16
-"""The same for references, all in one wavefront."""
-
 LONG_PILOTS = 32
 """As many where few pixels have nearly all of the variance of these."""
+
+REFERENCE_PILOTS = 16
+"""Pilots of references, all in one wavefront."""
 
 FEW_DEGREES = 30
 """Degrees of freedom of a variance that is not known well: its upper end is half more."""
@@ -114,7 +114,7 @@ def planned_images(scene, integrator, error, first_seed, sensor=0, known=False):
 
 
 def pilot_count(independent, known):
-    """How many short renderings: as many as a reference has where one wavefront traces them all."""
+    """How many short renderings: more where one wavefront traces them all."""
     if known and independent and not mi.variant().startswith("scalar"):
         return REFERENCE_PILOTS
     return PILOTS if independent and not known else 2 * PILOTS
@@ -160,7 +160,8 @@ def render_at_once(scene, integrator, spp, seeds, sensor=0):
 
     For integrators of Mitsuba and in Python, most of whose time goes into recording small renders.
     Each sample has random numbers of its own, so images are independent as those of seeds are. The
-    first seed of a wavefront stands for all. Its film has a box filter: not for wider ones.
+    first seed of a wavefront stands for all. Its film has a box filter: with wider ones, and in
+    scalar variants, images are rendered one by one with the scene's own sampler.
     """
     if mi.variant().startswith("scalar") or not has_independent_pixels(scene.sensors()[sensor]):
         return tools.render_seeds(scene, integrator, spp, seeds, sensor)

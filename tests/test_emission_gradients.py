@@ -210,6 +210,7 @@ def test_gradient_among_other_lights(llvm, name):
     lights = make()
     key = next(key for key in mi.traverse(load(lights)).keys() if key.endswith(suffix))  # noqa: SIM118
     scene, integrator = load(lights, others), mi.load_dict(DIRECT)
+    assert [name for name in mi.traverse(scene).keys() if name.endswith(key)] == [key]  # noqa: SIM118
     found = gradients(scene, key, integrator, 32)
     parameters = mi.traverse(scene)
     before, images = parameters[key], []

@@ -126,14 +126,14 @@ def test_scene_matches_reference(llvm, name, failure_folder):
 def test_scalar_variant_matches_reference(failure_folder):
     """The references hold for scalar variants, too."""
     require_variant("scalar_rgb")
-    images = images_of("points", load_scene("points"), 0)
+    images = images_of("points", load_scene("points", sampler="manylights_sobol"), 0)
     check(images, reference_path("points", 0), failure_folder)
 
 
 def test_planted_bias_is_found_and_drawn(llvm, tmp_path):
     """2 % more in the whole image, or 10 % more in one block, fails and leaves a picture."""
     path = reference_path("points", 0)
-    images = images_of("points", load_scene("points"), 0)
+    images = images_of("points", load_scene("points", sampler="manylights_sobol"), 0)
     check(images, path, tmp_path)
     assert not list(tmp_path.iterdir())
     one_block = images.copy()

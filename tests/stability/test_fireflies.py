@@ -3,8 +3,8 @@
 For each case percentiles.json has the 99.99th percentile q of a sample with all lights as
 candidates, resampled like the default's. A firefly is a sample of the default that is brighter than
 `tail` q, with `tail` = 10 unless the case says why not. It must not be more frequent than samples
-above q are in that reference: 1 in 10,000, tested with the binomial distribution, with as many
-samples as it takes to find three times as many. The maximum is listed in README.md: it grows with
+above q are in that reference: 1 in 10,000, tested with the binomial distribution; three times
+as many are found with 99 %. The maximum is listed in README.md: it grows with
 the number of samples, and no test is made of it.
 
 The variance of a sample has a limit, too, for each case: it tells when a cure stops working that
@@ -45,7 +45,10 @@ def assert_tail_of_reference(values, name):
 
 
 def assert_little_variance(values, limit):
-    """The relative variance, four numbers for each seed, is not significantly above the limit."""
+    """The relative variance, four numbers for each seed, is not significantly above the limit.
+
+    Quarters of an image share what it has learnt: the level is nominal where visibility is learnt.
+    """
     quarters = values.reshape(len(values), -1, 4)
     relative = quarters.var(axis=1).ravel() / (values.mean() or 1) ** 2
     if relative.mean() <= limit:

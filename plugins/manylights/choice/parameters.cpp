@@ -1,6 +1,8 @@
 #include "parameters.h"
 
 #include "manylights/base/properties.h"
+#include <algorithm>
+#include <limits>
 #include <sstream>
 
 namespace manylights {

@@ -14,7 +14,7 @@
 
 namespace manylights {
 
-/// Above it systematic sampling would lose the fraction of a float: visit all lights
+/// Above it all lights are visited
 constexpr float kMaxSplittingRate = 1 << 10;
 
 /// What decides whether a node is split: the talk's two functions, or the variance

@@ -38,7 +38,7 @@ public:
         : m_lights(lights), m_emission(scene, lights), m_media(scene, media),
           m_strategy(
               params, lights.tree().light_count, (uint32_t) lights.infinite().size(),
-              media.homogeneous || media.heterogeneous, has_exact_targets(lights, media)),
+              media.scattering || media.heterogeneous, has_exact_targets(lights, media)),
           m_mis(params.bsdf_samples > 0 &&
                 (lights.can_be_hit() || scene->environment() != nullptr)),
           m_samples(lights, m_emission, m_strategy, m_mis),

@@ -51,10 +51,13 @@ struct Effort {
     }
 };
 
-/// In media a piece of a path asks twice, for its segment and for its end
+/// In fog a piece of a path asks twice, for its segment and for its end; in smoke half pays, too
 inline Effort effort_of(const SamplingParameters &params, bool in_media) {
+    constexpr float most = 16.f;
+    // Systematic sampling would lose the fraction of a float
+    static_assert(most * kMaxSplittingRate <= 1 << 14);
     if (!params.several_bounces)
-        return { 16.f, 0.f, 16.f };
+        return { most, 0.f, most };
     return in_media ? Effort{ 3.f, 1.f, 1.f } : Effort{ 6.f, 2.f, 2.f };
 }
 
@@ -139,7 +142,7 @@ struct Strategy {
     /// That pays in scalar variants; in LLVM variants each slot is written with a selection.
     bool keeps_samples;
 
-    /// @param in_media       may vertices lie in media?
+    /// @param in_media       may light be scattered in media?
     /// @param exact_targets  does a target come from the sample that its ray would get?
     Strategy(const SamplingParameters &params, uint32_t lights, uint32_t infinite_lights,
              bool in_media, bool exact_targets)
