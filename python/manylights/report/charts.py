@@ -31,7 +31,7 @@ from manylights.report.statistics import (
     is_limited,
     last_clear_point,
     log_mean_of,
-    nanoseconds_per_sample,
+    sample_nanoseconds,
     time_to_reach,
 )
 
@@ -364,10 +364,7 @@ def _lights(scenes: list[Scene]) -> Figure:
         ]
         lights = [scene.lights for scene, _ in pairs]
         errors = [cost(series, scene).exp_interval() for scene, series in pairs]
-        times = [
-            nanoseconds_per_sample(last_clear_point(series, scene), scene)
-            for scene, series in pairs
-        ]
+        times = [sample_nanoseconds(series, scene) for scene, series in pairs]
         handles.append(_curve(panels[0], method, lights, errors, method))
         _curve(panels[1], method, lights, times, method)
         if all(series.build_seconds > 0 for _, series in pairs):
@@ -411,7 +408,7 @@ def _sweep(scene: Scene, parameter: str, groups: list[list[tuple]]) -> Figure:
         places = [numbers.index(float(value)) for value, _ in group]
         points = [last_clear_point(series, scene) for _, series in group]
         errors = [log_mean_of(point.error_trimmed * point.spp).exp_interval() for point in points]
-        times = [nanoseconds_per_sample(point, scene) for point in points]
+        times = [sample_nanoseconds(series, scene) for _, series in group]
         both = [cost(series, scene).exp_interval() for _, series in group]
         dash = DASHES[used.get(method, 0) % len(DASHES)]
         used[method] = used.get(method, 0) + 1

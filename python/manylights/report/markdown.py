@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from manylights import files
 from manylights.bench.methods import ABOUT, MITSUBAS, OURS
 from manylights.bench.records import Results, Scene, Series
 from manylights.report import grouping, tables
-from manylights.report.statistics import gain, is_mostly_preparation, sample_seconds
+from manylights.report.statistics import gain, is_mostly_preparation, sample_nanoseconds
 from manylights.report.text import number, percent, ratio
 
 NAME = "README.md"
@@ -164,9 +163,7 @@ def _gain(peer: Series | None, ours: Series, scene: Scene) -> str:
 def _nanoseconds(scene: Scene, best: dict[str, Series]) -> str:
     """Return the time of a sample of Mitsuba's uniform sampling and of ours."""
     return ", ".join(
-        number(1e9 * math.exp(sample_seconds(best[name]).value) / scene.pixels)
-        if name in best
-        else "-"
+        number(sample_nanoseconds(best[name], scene).value) if name in best else "-"
         for name in (MITSUBAS[0], OURS[0])
     )
 

@@ -145,6 +145,13 @@ def sample_seconds(series: Series) -> SampleMean:
     return SampleMean(math.log(value), slope.variance / value**2, slope.freedom)
 
 
+def sample_nanoseconds(series: Series, scene: Scene) -> Interval:
+    """The same for one sample of one pixel."""
+    seconds = sample_seconds(series).exp_interval()
+    ends = (seconds.value, seconds.low, seconds.high)
+    return Interval(*(1e9 * end / scene.pixels for end in ends))
+
+
 def is_mostly_preparation(series: Series) -> bool:
     """Whether the renderings are too short to tell what one more sample takes."""
     last = series.points[-1]
