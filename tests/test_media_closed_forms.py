@@ -385,3 +385,30 @@ def test_polarizer_before_a_surface_at_brewsters_angle(variant):
     tools.assert_same_mean(free, upright + flat, label="both polarizers together")
     weak, strong = sorted([upright.mean(), flat.mean()])
     assert weak < 0.01 * strong
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"], indirect=True)
+def test_slanted_ray_through_a_slab(variant):
+    """Two borders move a ray aside, and the light of a point keeps its length in between."""
+    extinction, thickness, light = 20.0, 0.16, np.array([2.5, 0.3, 1.0])
+    fog = {"type": "homogeneous", "sigma_t": extinction, "albedo": 0.0}
+    to_world = mi.ScalarTransform4f().translate([0, 0, 0.2]).scale([8, 8, thickness / 2])
+    slab = {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}}
+    scene = {
+        "type": "scene",
+        "floor": {"type": "rectangle"},
+        "light": {"type": "point", "position": light.tolist()},
+        "sensor": {
+            "type": "radiancemeter",
+            "origin": [0, 0, 0.05],
+            "direction": [0, 0, -1],
+            "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}},
+        },
+    }
+    integrator = mi.load_dict({"type": "manylights_volpath", "max_depth": 2})
+    clear, dim = (
+        np.array(mi.render(mi.load_dict(scene | slabs), integrator=integrator, spp=4)).mean()
+        for slabs in ({}, {"slab": {**slab, "interior": fog}})
+    )
+    length = thickness * np.linalg.norm(light) / light[2]
+    assert dim / clear == pytest.approx(np.exp(-extinction * length), rel=3e-4)

@@ -176,7 +176,7 @@ private:
                 dr::masked(s.result, hit && !passes) = Spectrum(0.f);
                 s.active &= !hit || passes;
 
-                Float end   = dr::select(passes, dr::dot(si.p - from.p, d), distance);
+                Float end   = dr::select(passes, crossing(from.p, d, si), distance);
                 Mask inside = s.active && s.medium != nullptr;
                 if (dr::any_or<true>(inside)) {
                     Ray3f piece = s.ray;
@@ -196,6 +196,15 @@ private:
             "Media: transmittance");
         rng = std::move(state.rng);
         return state.result;
+    }
+
+    /// Where the straight line meets a border: rays behind others start aside of it, and would
+    /// leave a slanted slab early
+    static Float crossing(const Point3f &from, const Vector3f &d,
+                          const SurfaceInteraction3f &si) {
+        Float slope = dr::dot(d, si.n), along = dr::dot(si.p - from, d);
+        return dr::select(dr::abs(slope) > .05f, dr::dot(si.p - from, si.n) / slope,
+                          along);
     }
 
     /// Transmittance of a piece of a ray, closed form or ratio tracking
