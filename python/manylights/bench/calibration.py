@@ -22,6 +22,9 @@ SECOND = 4.0
 #: An equal-time rendering is made if one sample takes at most so many times the time.
 TOLERANCE = 1.5
 
+#: One more sample takes at least this share of a render's mean time: noise must not make it free.
+LEAST_SLOPE = 0.1
+
 #: From the number of samples to the seconds of a render.
 Measure = Callable[[int], float]
 
@@ -95,6 +98,5 @@ def _line(times: dict[int, float]) -> tuple[float, float]:
         ((spp, seconds),) = points
         return 0.0, seconds / spp
     (few, low), (many, high) = points
-    # Noise must not make samples free.
-    slope = max((high - low) / (many - few), 0.1 * high / many)
+    slope = max((high - low) / (many - few), LEAST_SLOPE * high / many)
     return max(high - slope * many, 0.0), slope

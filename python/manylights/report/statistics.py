@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
+from manylights.bench.calibration import LEAST_SLOPE
 from manylights.bench.records import Point, Scene, Series
 
 #: Two-sided level of all intervals.
@@ -25,9 +26,6 @@ CLEARLY_ABOVE = 10.0
 
 #: How far beyond its measurements a series is continued, with error times time constant.
 MAX_EXTRAPOLATION = 10.0
-
-#: The least share of a rendering's mean time per sample that one more sample is taken to need.
-LEAST_SLOPE = 0.1
 
 
 @dataclass(frozen=True)
